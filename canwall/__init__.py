@@ -1,0 +1,1 @@
+"""A virtual wall on an industrial servo drive over CANopen."""

@@ -1,0 +1,331 @@
+"""Settings of a run: one TOML file, validated, immutable, in SI units.
+
+Every key carries its unit in its name. What is unknown, misspelt, of the wrong type or impossible
+is a `ConfigError` of one line: file, key, what is wrong, what to do.
+"""
+
+import difflib
+import math
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, get_args
+
+import tomli_w
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used; the text is one line for the user."""
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
+
+
+# TOML writes a whole number without a point: `cycle_s = 1` is meant as 1.0.
+def _number(value: object) -> object:
+    return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+Number = Annotated[float, BeforeValidator(_number)]
+Positive = Annotated[Number, Field(gt=0)]
+NonNegative = Annotated[Number, Field(ge=0)]
+
+
+class Bus(_Section):
+    """`[bus]`: where the drive is, and how long one period of the SYNC is."""
+
+    interface: str = "virtual"
+    channel: str = "canwall"
+    bitrate: int = Field(1_000_000, gt=0)
+    cycle_s: Annotated[Positive, Field(le=1.0)] = 0.001
+    pace: Literal["auto", "real_time", "simulated"] = "auto"
+
+
+class Drive(_Section):
+    """`[drive]`: which node, described by which EDS or DCF."""
+
+    node_id: int = Field(ge=1, le=127)
+    eds: Path
+    mode: Literal["auto", "cst"] = "auto"
+    rated_torque_nm: Positive | None = None
+    counts_per_rev: Positive | None = None
+    gear_ratio: Positive | None = None
+    wait_s: NonNegative = 5.0
+
+    @field_validator("eds", mode="before")
+    @classmethod
+    def _path(cls, value: object) -> object:
+        return Path(value) if isinstance(value, str) else value
+
+
+class Mechanics(_Section):
+    """`[mechanics]`: the model of everything that moves, as the laws use it."""
+
+    inertia_kg_m2: Positive
+    viscous_nm_s_per_rad: NonNegative = 0.0
+    coulomb_nm: NonNegative = 0.0
+    handle_radius_m: Positive | None = None
+
+
+class Wall(_Section):
+    """`[wall]`: where it is, how stiff, and by which law it is rendered."""
+
+    law: str = "half_sample"
+    position_rad: Number = 0.0
+    side: Literal["below", "above"] = "below"
+    stiffness_nm_per_rad: NonNegative = 50.0
+    damping_nm_s_per_rad: NonNegative = 0.0
+    tension: Literal["allow", "clamp"] = "allow"
+
+
+class Estimator(_Section):
+    """`[estimator]`: how fast the Kalman filter follows the operator's force."""
+
+    bandwidth_hz: Positive = 150.0
+
+
+class Limits(_Section):
+    """`[limits]`: torque is held to its limit; speed and position beyond theirs end the run."""
+
+    torque_nm: Positive
+    speed_rad_s: Positive = 60.0
+    position_rad: tuple[Number, Number] = (-3.0, 3.0)
+    hold_cycles: int = Field(2, ge=0, le=100)
+    ramp_cycles: int = Field(10, ge=1, le=1000)
+
+    @field_validator("position_rad", mode="before")
+    @classmethod
+    def _pair(cls, value: object) -> object:
+        return tuple(value) if isinstance(value, list) else value
+
+    @field_validator("position_rad")
+    @classmethod
+    def _ordered(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if not value[0] < value[1]:
+            raise ValueError("the lower limit has to come first and lie below the upper one")
+        return value
+
+
+class Hand(_Section):
+    """`[simulation.hand]`: a mass, spring and damper about a hand that strikes by script."""
+
+    inertia_kg_m2: NonNegative = 6.4e-5
+    damping_nm_s_per_rad: NonNegative = 0.0256
+    stiffness_nm_per_rad: NonNegative = 3.2
+    strikes: int = Field(4, ge=0)
+    first_strike_s: NonNegative = 0.2
+    interval_s: Positive = 1.0
+    rest_rad: Number = 0.1
+    press_rad: Number = -0.1
+    approach_s: Positive = 0.1
+    press_s: NonNegative = 0.5
+    withdraw_s: Positive = 0.1
+
+    @model_validator(mode="after")
+    def _strikes_fit(self) -> Self:
+        lasts = self.approach_s + self.press_s + self.withdraw_s
+        if self.strikes > 1 and lasts > self.interval_s:
+            raise ValueError(
+                f"a strike lasts {lasts:g} s (approach_s + press_s + withdraw_s) and does not fit "
+                f"into interval_s = {self.interval_s:g}"
+            )
+        return self
+
+
+class Simulation(_Section):
+    """`[simulation]`: the mechanics of the simulated drive, and the hand on its handle."""
+
+    inertia_kg_m2: Positive = 1.0e-4
+    viscous_nm_s_per_rad: NonNegative = 5.0e-4
+    coulomb_nm: NonNegative = 0.01
+    hand: Hand = Hand()
+
+
+class Run(_Section):
+    """`[run]`: how long, and in which format the bus log is kept."""
+
+    duration_s: Positive | None = None
+    bus_log: Literal["bus.log", "bus.asc", "bus.blf", "bus.csv", "bus.trc", "bus.db"] = "bus.log"
+
+
+class Change(_Section):
+    """`[[schedule]]`: from at_s on, these keys of `[wall]` have these values."""
+
+    at_s: NonNegative
+    law: str | None = None
+    position_rad: Number | None = None
+    stiffness_nm_per_rad: NonNegative | None = None
+    damping_nm_s_per_rad: NonNegative | None = None
+    tension: Literal["allow", "clamp"] | None = None
+
+
+class Settings(_Section):
+    """Everything that one run needs to know."""
+
+    bus: Bus = Bus()
+    drive: Drive
+    mechanics: Mechanics
+    wall: Wall = Wall()
+    estimator: Estimator = Estimator()
+    limits: Limits
+    run: Run = Run()
+    simulation: Simulation | None = None
+    schedule: tuple[Change, ...] = ()
+
+    @field_validator("schedule", mode="before")
+    @classmethod
+    def _changes(cls, value: object) -> object:
+        return tuple(value) if isinstance(value, list) else value
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if [c.at_s for c in self.schedule] != sorted(c.at_s for c in self.schedule):
+            raise ValueError("schedule: the entries have to be in the order of at_s")
+        low, high = self.limits.position_rad
+        if not low < self.wall.position_rad < high:
+            raise ValueError(
+                f"wall.position_rad = {self.wall.position_rad:g} lies outside "
+                f"limits.position_rad = [{low:g}, {high:g}]"
+            )
+        return self
+
+    @property
+    def walls(self) -> list[tuple[float, Wall]]:
+        """The wall in force from each instant on: (at_s, wall), the first at 0."""
+        timeline = [(0.0, self.wall)]
+        for change in self.schedule:
+            update = change.model_dump(exclude={"at_s"}, exclude_none=True)
+            timeline.append((change.at_s, timeline[-1][1].model_copy(update=update)))
+        return timeline
+
+    @property
+    def embedded(self) -> bool:
+        """Whether the simulated drive lives in the same process as the master.
+
+        python-can's virtual bus ends at the process; on every other bus the simulated drive is a
+        process of its own (`canwall drive`).
+        """
+        return self.simulation is not None and self.bus.interface == "virtual"
+
+    @property
+    def real_time(self) -> bool:
+        """Whether SYNCs keep to the wall clock, or go out as fast as the simulation answers."""
+        if self.bus.pace == "auto":
+            return self.simulation is None
+        return self.bus.pace == "real_time"
+
+    def to_toml(self) -> str:
+        """The settings as a TOML file that `load` reads back to the same settings."""
+        return tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
+
+
+# Lengths and forces at a handle of radius r are angles and torques at its shaft: [wall] may be
+# written in either. The exponent of r takes the metric value to the angular one.
+_AT_THE_HANDLE = {
+    "position_m": ("position_rad", -1),
+    "stiffness_n_per_m": ("stiffness_nm_per_rad", 2),
+    "damping_n_s_per_m": ("damping_nm_s_per_rad", 2),
+}
+
+
+def _at_the_shaft(raw: dict[str, Any]) -> None:
+    radius = raw.get("mechanics", {}).get("handle_radius_m")
+    if not isinstance(radius, int | float) or not radius > 0:
+        return
+    for section in (raw.get("wall", {}), *raw.get("schedule", [])):
+        for metric, (angular, exponent) in _AT_THE_HANDLE.items():
+            if metric not in section:
+                continue
+            if angular in section:
+                raise ConfigError(f"wall.{metric}: {angular} is given as well; keep one of them")
+            section[angular] = section.pop(metric) * float(radius) ** exponent
+
+
+def load(path: Path, overrides: Mapping[str, Any] | None = None) -> Settings:
+    """Read and validate a TOML file; `overrides` maps dotted keys to values that go first.
+
+    Paths in the file are relative to the file. Raises ConfigError.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; give the path of a configuration") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from None
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from None
+    for dotted, value in (overrides or {}).items():
+        section, key = dotted.split(".")
+        raw.setdefault(section, {})[key] = value
+    try:
+        _at_the_shaft(raw)
+        settings = Settings.model_validate(raw)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {_first_error(error, raw)}") from None
+    except (TypeError, AttributeError):
+        raise ConfigError(f"{path}: a section is not a table; see config/sim.toml") from None
+    eds = settings.drive.eds
+    if not eds.is_absolute():
+        drive = settings.drive.model_copy(update={"eds": (path.parent / eds).resolve()})
+        settings = settings.model_copy(update={"drive": drive})
+    return settings
+
+
+def _first_error(error: ValidationError, raw: Mapping[str, Any]) -> str:
+    """One line for the first thing that is wrong: key, what, what to do."""
+    first = error.errors()[0]
+    where = [str(part) for part in first["loc"]]
+    key = ".".join(where)
+    given = first["input"]
+    if first["type"] == "extra_forbidden":
+        return f"{key}: unknown key{_suggestion(where)}"
+    if first["type"] == "missing":
+        return f"{key}: is missing; add it"
+    message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    if not key:
+        return message
+    if first["type"] == "value_error":
+        return f"{key}: {message}"
+    return f"{key}: has to be {message}, not {_shown(given)}"
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return repr(value) if isinstance(value, str | int | float | bool) else type(value).__name__
+
+
+def _suggestion(where: list[str]) -> str:
+    model: Any = Settings
+    for part in where[:-1]:
+        if part.isdigit():
+            continue
+        annotation = model.model_fields[part].annotation
+        candidates = [annotation, *get_args(annotation)]
+        model = next(c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel))
+    known = list(model.model_fields)
+    if where[-1] in _AT_THE_HANDLE:
+        return "; lengths and forces at the handle need mechanics.handle_radius_m"
+    close = difflib.get_close_matches(where[-1], known, n=1, cutoff=0.5)
+    return f"; did you mean {close[0]}?" if close else f"; known here: {', '.join(known)}"
+
+
+def shipped(relative: str) -> Path:
+    """A file that comes with the project, e.g. `config/sim.toml`, in a checkout or installed."""
+    package = Path(__file__).resolve().parent
+    installed = package / "data" / relative
+    return installed if installed.exists() else package.parent / relative

@@ -1,0 +1,20 @@
+"""Exact motion of what the wall acts on: oscillator flow, ZOH equivalents, friction, contact.
+
+Everything is compiled and free of allocation on the hot path. Nothing here knows of walls as
+control laws, of drives or of CAN.
+"""
+
+from canwall.physics.motion import MAX_EVENTS, PLANT, advance, make_plant
+from canwall.physics.oscillator import acceleration, basis, flow, zoh, zoh_coefficients
+
+__all__ = [
+    "MAX_EVENTS",
+    "PLANT",
+    "acceleration",
+    "advance",
+    "basis",
+    "flow",
+    "make_plant",
+    "zoh",
+    "zoh_coefficients",
+]

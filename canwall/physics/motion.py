@@ -1,0 +1,203 @@
+"""Motion of a handle with Coulomb friction and, where there is one, a continuous wall: event-exact.
+
+Between events the handle is the linear oscillator of `oscillator`. Events are the reversal of
+the velocity (where friction changes its sign, or the handle sticks) and the crossing of the wall
+at y = 0. Each is found as the one root in a bracket on which its function is monotone, so none is
+missed and none is found twice.
+
+The same function moves the simulated drive (no wall: the drive's torque is the wall) and the
+continuous referent that every law is compared with (a wall of stiffness K and damping B).
+"""
+
+import math
+
+import numpy as np
+from numba import from_dtype
+from numpy.typing import NDArray
+
+from canwall.compiled import Record, compiled
+from canwall.physics.oscillator import acceleration, flow
+
+#: What moves and what it moves against. Inside the wall (y < 0) stiffness K and damping B join
+#: the spring and the viscous damping. Units: any consistent set, SI in this project.
+PLANT = np.dtype(
+    [
+        ("mass", "f8"),
+        ("viscous", "f8"),
+        ("spring", "f8"),
+        ("coulomb", "f8"),
+        ("wall_stiffness", "f8"),
+        ("wall_damping", "f8"),
+    ],
+    align=True,
+)
+PLANT_TYPE = from_dtype(PLANT)
+
+#: Events within one call of `advance` beyond which the motion is taken for lost and returned as
+#: NaN rather than followed for ever. A period of a servo loop has a handful.
+MAX_EVENTS = 1_000_000
+
+_POSITION, _VELOCITY, _ACCELERATION = 0, 1, 2
+_MAX_ITERATIONS = 200
+
+
+def make_plant(
+    mass: float,
+    viscous: float = 0.0,
+    spring: float = 0.0,
+    coulomb: float = 0.0,
+    wall_stiffness: float = 0.0,
+    wall_damping: float = 0.0,
+) -> NDArray[np.void]:
+    """One plant as an array of shape (1,) and dtype PLANT, as compiled code takes it.
+
+    Raises ValueError unless mass > 0 and the rest ≥ 0, all finite.
+    """
+    values = (mass, viscous, spring, coulomb, wall_stiffness, wall_damping)
+    if not all(math.isfinite(x) and x >= 0.0 for x in values) or mass == 0.0:
+        raise ValueError(f"a plant needs mass > 0 and finite parameters ≥ 0, not {values}")
+    return np.array([values], dtype=PLANT)
+
+
+@compiled
+def _derivatives(
+    mass: float, viscous: float, spring: float, y: float, v: float, u0: float, u1: float, t: float
+) -> tuple[float, float, float, float]:
+    """Position, velocity, acceleration and jerk at time t."""
+    y, v = flow(mass, viscous, spring, y, v, u0, u1, t)
+    a = acceleration(mass, viscous, spring, y, v, u0 + u1 * t)
+    return y, v, a, (u1 - viscous * a - spring * v) / mass
+
+
+@compiled
+def _root(
+    order: int,
+    mass: float,
+    viscous: float,
+    spring: float,
+    y: float,
+    v: float,
+    u0: float,
+    u1: float,
+    low: float,
+    high: float,
+    rising: bool,
+) -> float:
+    """The root of position, velocity or acceleration in (low, high]: Newton kept in its bracket."""
+    t = 0.5 * (low + high)
+    for _ in range(_MAX_ITERATIONS):
+        y_t, v_t, a_t, jerk_t = _derivatives(mass, viscous, spring, y, v, u0, u1, t)
+        if order == _POSITION:
+            value, slope = y_t, v_t
+        elif order == _VELOCITY:
+            value, slope = v_t, a_t
+        else:
+            value, slope = a_t, jerk_t
+        if (value < 0.0) == rising:
+            low = t
+        else:
+            high = t
+        step = value / slope if slope != 0.0 else math.inf
+        proposal = t - step
+        if not low < proposal < high:
+            proposal = 0.5 * (low + high)
+        if abs(proposal - t) <= 2e-16 * high or proposal in (low, high):
+            return proposal
+        t = proposal
+    return t
+
+
+@compiled
+def _reversal(
+    mass: float,
+    viscous: float,
+    spring: float,
+    y: float,
+    v: float,
+    u0: float,
+    u1: float,
+    direction: float,
+    span: float,
+) -> float:
+    """First time in (0, span] at which the velocity has turned against `direction`, else span.
+
+    span is at most a quarter period, so the acceleration has one zero at the most and the
+    velocity is monotone on either side of it.
+    """
+    _, v_end, a_end, _ = _derivatives(mass, viscous, spring, y, v, u0, u1, span)
+    a_start = acceleration(mass, viscous, spring, y, v, u0)
+    peak = span
+    if a_start * a_end < 0.0:
+        peak = _root(_ACCELERATION, mass, viscous, spring, y, v, u0, u1, 0.0, span, a_end > 0.0)
+        _, v_peak, _, _ = _derivatives(mass, viscous, spring, y, v, u0, u1, peak)
+        if direction * v_peak < 0.0:
+            return _root(_VELOCITY, mass, viscous, spring, y, v, u0, u1, 0.0, peak, direction < 0.0)
+    else:
+        peak = 0.0
+    if direction * v_end < 0.0:
+        return _root(_VELOCITY, mass, viscous, spring, y, v, u0, u1, peak, span, direction < 0.0)
+    return span
+
+
+@compiled
+def advance(
+    plant: Record, y: float, v: float, u0: float, u1: float, duration: float
+) -> tuple[float, float]:
+    """State (y, ẏ) after `duration` under the external force u₀ + u₁·t, from (y, v).
+
+    plant is a record of dtype PLANT, y is measured from the wall (y < 0 inside). Coulomb friction
+    is set-valued at rest: the handle sticks as long as what pulls it stays within ±coulomb, and
+    starts to slip at the very instant at which it no longer does.
+    """
+    has_wall = plant.wall_stiffness > 0.0 or plant.wall_damping > 0.0
+    t = 0.0
+    for _ in range(MAX_EVENTS):
+        if not t < duration:
+            return y, v
+        u = u0 + u1 * t
+        # On the threshold the direction of motion decides, at rest what presses on the handle.
+        inside = has_wall and (
+            y < 0.0 or (y == 0.0 and (v < 0.0 or (v == 0.0 and u - plant.spring * y < 0.0)))
+        )
+        viscous = plant.viscous + (plant.wall_damping if inside else 0.0)
+        spring = plant.spring + (plant.wall_stiffness if inside else 0.0)
+        remaining = duration - t
+        if v == 0.0:
+            pull = u - spring * y
+            if abs(pull) <= plant.coulomb:
+                # Stuck until the ramp of the external force breaks it loose, if it does.
+                slack = plant.coulomb - pull if u1 > 0.0 else plant.coulomb + pull
+                breakaway = slack / abs(u1) if u1 != 0.0 else math.inf
+                if breakaway >= remaining:
+                    return y, v
+                t += breakaway
+                remaining -= breakaway
+                direction = 1.0 if u1 > 0.0 else -1.0
+                # Friction and spring balance to the last bit here; recomputed from u₀ + u₁·t the
+                # acceleration could come out with the wrong sign and end the slip at once.
+                force = spring * y
+            else:
+                direction = 1.0 if pull > 0.0 else -1.0
+                force = u - direction * plant.coulomb
+        else:
+            direction = 1.0 if v > 0.0 else -1.0
+            force = u - direction * plant.coulomb
+        omega = math.sqrt(spring / plant.mass)
+        span = min(remaining, 0.5 * math.pi / omega) if omega > 0.0 else remaining
+        # Up to its reversal the velocity keeps its sign, so the position is monotone.
+        dt = _reversal(plant.mass, viscous, spring, y, v, force, u1, direction, span)
+        y_end, v_end = flow(plant.mass, viscous, spring, y, v, force, u1, dt)
+        reversed_here = direction * v_end <= 0.0 or dt < span
+        leaves = inside and direction > 0.0 and y_end >= 0.0
+        enters = has_wall and not inside and direction < 0.0 and y_end < 0.0
+        if leaves or enters:
+            dt = _root(
+                _POSITION, plant.mass, viscous, spring, y, v, force, u1, 0.0, dt, direction > 0.0
+            )
+            _, v = flow(plant.mass, viscous, spring, y, v, force, u1, dt)
+            y = 0.0
+        else:
+            y = y_end
+            v = 0.0 if reversed_here else v_end
+        t = duration if dt >= remaining else t + dt
+    return math.nan, math.nan

@@ -1,0 +1,82 @@
+"""Motor, encoder and the hand on the handle: what the simulated drive moves and measures."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canwall.config import Simulation
+from canwall.physics import advance, make_plant
+from canwall.simdrive.hand import hand_path
+
+
+def hand_plant(simulation: Simulation) -> dict[str, float]:
+    """What moves, as keywords of `physics.make_plant`: drive, handle and hand as one."""
+    hand = simulation.hand
+    return {
+        "mass": simulation.inertia_kg_m2 + hand.inertia_kg_m2,
+        "viscous": simulation.viscous_nm_s_per_rad + hand.damping_nm_s_per_rad,
+        "spring": hand.stiffness_nm_per_rad,
+        "coulomb": simulation.coulomb_nm,
+    }
+
+
+def hand_force(
+    simulation: Simulation, path: NDArray[np.float64], period_s: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Force of a hand whose position moves along `path`, (u₀, u₁) of u₀ + u₁·t in each period.
+
+    path has shape (n + 1,) [rad]; u₀ [N·m] and u₁ [N·m/s] have shape (n,). The part that depends
+    on the handle's own position and velocity is in the plant.
+    """
+    hand = simulation.hand
+    speed = np.diff(path) / period_s
+    spring, damper = hand.stiffness_nm_per_rad, hand.damping_nm_s_per_rad
+    return spring * path[:-1] + damper * speed, spring * speed
+
+
+class ServoMotion:
+    """Motor, handle and hand, advanced by the drive one SYNC period at a time.
+
+    The hand starts at rest where its script does, and the handle with it. The script is laid out
+    in pieces as time goes on; after its last strike the hand rests.
+    """
+
+    _PIECE = 4096
+
+    def __init__(self, simulation: Simulation, period_s: float, counts_per_rev: float) -> None:
+        self._simulation = simulation
+        self._period_s = period_s
+        self._counts_per_rad = counts_per_rev / (2.0 * math.pi)
+        self._plant = make_plant(**hand_plant(simulation))[0]
+        self._elapsed = 0
+        self.position_rad = float(hand_path(simulation.hand, period_s, 0)[0])
+        self.speed_rad_s = 0.0
+        self._lay_out(self._PIECE)
+
+    def _lay_out(self, periods: int) -> None:
+        path = hand_path(self._simulation.hand, self._period_s, periods)
+        constant, slope = hand_force(self._simulation, path, self._period_s)
+        self._constant, self._slope = constant.tolist(), slope.tolist()
+
+    def counts(self) -> int:
+        """Encoder position [increments], the nearest one."""
+        return math.floor(self.position_rad * self._counts_per_rad + 0.5)
+
+    def speed_counts_per_s(self) -> float:
+        """Speed in increments per second, as 0x606C gives it."""
+        return self.speed_rad_s * self._counts_per_rad
+
+    def advance(self, torque_nm: float, duration_s: float) -> None:
+        """One period of the script under a held torque."""
+        if self._elapsed >= len(self._constant):
+            self._lay_out(2 * len(self._constant))
+        self.position_rad, self.speed_rad_s = advance(
+            self._plant,
+            self.position_rad,
+            self.speed_rad_s,
+            torque_nm + self._constant[self._elapsed],
+            self._slope[self._elapsed],
+            duration_s,
+        )
+        self._elapsed += 1

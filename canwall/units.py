@@ -1,0 +1,69 @@
+"""Counts and per mille of the drive ↔ radians and newton metres of the wall: the one place.
+
+CiA 402 drives give positions in encoder increments and take torque in per mille of the rated
+torque. Both scales stand in the drive's own objects; what rounding the bus imposes is applied
+here and nowhere else, so the torque that the laws reckon with is the torque that the bus carries.
+"""
+
+import math
+from dataclasses import dataclass
+
+from canwall.compiled import compiled
+
+#: 0x6071 and 0x6077 are INTEGER16.
+MAX_PER_MILLE = 32767
+
+
+@dataclass(frozen=True)
+class DriveUnits:
+    """Scales of one drive.
+
+    counts_per_rev: increments of 0x6064 per revolution of the shaft that carries the handle.
+    rated_torque_nm: torque at that shaft which 1000 of 0x6071 stands for.
+    Raises ValueError unless both are finite and positive.
+    """
+
+    counts_per_rev: float
+    rated_torque_nm: float
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (math.isfinite(value) and value > 0.0):
+                raise ValueError(f"{name} has to be positive, not {value}")
+
+    @property
+    def rad_per_count(self) -> float:
+        """Size of one encoder count Δ [rad]."""
+        return 2.0 * math.pi / self.counts_per_rev
+
+    @property
+    def nm_per_mille(self) -> float:
+        """Size of one step of torque f_LSB [N·m]."""
+        return self.rated_torque_nm / 1000.0
+
+    @classmethod
+    def from_objects(
+        cls,
+        increments: int,
+        revolutions: int,
+        gear_motor_revolutions: int,
+        gear_shaft_revolutions: int,
+        rated_torque_mnm: int,
+    ) -> "DriveUnits":
+        """From 0x608F:01/:02 (encoder), 0x6091:01/:02 (gear) and 0x6076 (rated torque, mN·m).
+
+        0x6076 is the motor's; behind a gear the handle feels it times the ratio.
+        """
+        if min(increments, revolutions, gear_motor_revolutions, gear_shaft_revolutions) <= 0:
+            raise ValueError("0x608F and 0x6091 have to be positive")
+        gear = gear_motor_revolutions / gear_shaft_revolutions
+        return cls(increments / revolutions * gear, rated_torque_mnm / 1000.0 * gear)
+
+
+@compiled
+def to_per_mille(torque_nm: float, nm_per_mille: float, limit_nm: float) -> int:
+    """Torque as 0x6071 carries it: nearest step, none beyond ±limit, INTEGER16. NaN becomes 0."""
+    if not math.isfinite(torque_nm):
+        return 0
+    largest = min(math.floor(limit_nm / nm_per_mille + 1e-9), MAX_PER_MILLE)
+    return int(min(max(math.floor(torque_nm / nm_per_mille + 0.5), -largest), largest))

@@ -1,0 +1,148 @@
+"""State at the instant of actuation: a Kalman filter on [y, ẏ, d] and the committed forces.
+
+Between the sample y[j] and the moment at which the force computed from it takes effect lie D
+periods, and all forces of that time are already on their way. So the state at that moment is no
+extrapolation but a computation: x̂[j+D] = Φ·x̂[j] + Γ·(f_committed + d̂) (theory, section 3).
+d̂, the bias force, makes the operator's push observable, so it need not be known.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_discrete_are
+
+from canwall.compiled import Record, compiled
+from canwall.physics import zoh
+
+#: Largest delay, in whole periods, between a sample and the force computed from it.
+MAX_DELAY = 3
+
+_HOLD = [("phi", "f8", (2, 2)), ("gamma", "f8", (2,))]
+
+#: Filter and model of one wall. `before` and `after` are the hold equivalents over the two parts
+#: of a period that an actuation δ·T after the sample cuts it into; `full` is the whole period.
+ESTIMATOR = np.dtype(
+    [
+        ("y", "f8"),
+        ("v", "f8"),
+        ("d", "f8"),
+        ("gain", "f8", (3,)),
+        ("delay_periods", "i8"),
+        ("full", _HOLD, (1,)),
+        ("before", _HOLD, (1,)),
+        ("after", _HOLD, (1,)),
+        # The last forces, newest first: committed[0] was computed one sample ago.
+        ("committed", "f8", (MAX_DELAY + 1,)),
+    ],
+    align=True,
+)
+
+
+def kalman_gain(
+    mass: float, viscous: float, spring: float, period: float, count: float, bandwidth_hz: float
+) -> NDArray[np.float64]:
+    """Steady-state gain on [y, ẏ, d] for a position quantised in steps of `count`; shape (3,).
+
+    Measurement noise R = count²/12. The bias force is a random walk, as strong as makes the
+    continuous filter of a pure mass have its (Butterworth) poles at `bandwidth_hz`:
+    q = m²·R·T·ω⁶ per second. Raises ValueError where the filter would be faster than a fifth of
+    the sampling rate.
+    """
+    if bandwidth_hz * period > 0.2:
+        raise ValueError(
+            f"a bandwidth of {bandwidth_hz:g} Hz is too much for a cycle of {period:g} s; "
+            f"keep it below {0.2 / period:g} Hz"
+        )
+    phi, gamma = zoh(mass, viscous, spring, period)
+    a = np.eye(3)
+    a[:2, :2] = phi
+    a[:2, 2] = gamma
+    c = np.array([[1.0, 0.0, 0.0]])
+    omega = 2.0 * math.pi * bandwidth_hz
+    # In units of the count, of the velocity and of the force that go with it at this bandwidth the
+    # covariances are of one order, and the Riccati solver keeps its digits.
+    scale = np.array([1.0, omega, mass * omega * omega])
+    a = a * scale[None, :] / scale[:, None]
+    noise = np.diag([0.0, 0.0, period * period * omega * omega / 12.0])
+    prior = solve_discrete_are(a.T, c.T, noise, np.array([[1.0 / 12.0]]))
+    gain = prior @ c.T / (c @ prior @ c.T + 1.0 / 12.0)
+    return np.asarray(gain[:, 0] * scale)
+
+
+def set_estimator(
+    estimator: NDArray[np.void],
+    mass: float,
+    viscous: float,
+    spring: float,
+    period: float,
+    count: float,
+    bandwidth_hz: float,
+    delay: float,
+) -> None:
+    """Write model, gain and delay D (in periods, 0 ≤ D ≤ MAX_DELAY) into an ESTIMATOR array (1,).
+
+    Raises ValueError for a delay or a bandwidth out of range.
+    """
+    if not 0.0 <= delay <= MAX_DELAY:
+        raise ValueError(f"a delay of {delay:g} periods is not between 0 and {MAX_DELAY}")
+    whole = math.floor(delay)
+    fraction = delay - whole
+    estimator["delay_periods"] = whole
+    estimator["gain"] = kalman_gain(mass, viscous, spring, period, count, bandwidth_hz)
+    for name, share in (("full", 1.0), ("before", fraction), ("after", 1.0 - fraction)):
+        phi, gamma = zoh(mass, viscous, spring, share * period)
+        estimator[name]["phi"] = phi
+        estimator[name]["gamma"] = gamma
+
+
+def reset_estimator(estimator: NDArray[np.void], y: float) -> None:
+    """Start at rest at y, with no force known to act."""
+    estimator["y"] = y
+    estimator["v"] = estimator["d"] = 0.0
+    estimator["committed"] = 0.0
+
+
+@compiled
+def _hold(model: Record, y: float, v: float, force: float) -> tuple[float, float]:
+    phi, gamma = model.phi, model.gamma
+    return (
+        phi[0, 0] * y + phi[0, 1] * v + gamma[0] * force,
+        phi[1, 0] * y + phi[1, 1] * v + gamma[1] * force,
+    )
+
+
+@compiled
+def observe(estimator: Record, y_sample: float) -> None:
+    """Correct the state with the sample y[j]: x̂[j|j] = x̂[j|j−1] + L·(y[j] − ŷ[j|j−1])."""
+    innovation = y_sample - estimator.y
+    estimator.y += estimator.gain[0] * innovation
+    estimator.v += estimator.gain[1] * innovation
+    estimator.d += estimator.gain[2] * innovation
+
+
+@compiled
+def actuation_state(estimator: Record) -> tuple[float, float]:
+    """State (ŷ, ẏ̂) at the instant at which the force computed now takes effect."""
+    n = estimator.delay_periods
+    y, v = _hold(
+        estimator.before[0], estimator.y, estimator.v, estimator.committed[n] + estimator.d
+    )
+    for age in range(n - 1, -1, -1):
+        y, v = _hold(estimator.full[0], y, v, estimator.committed[age] + estimator.d)
+    return y, v
+
+
+@compiled
+def commit(estimator: Record, force: float) -> None:
+    """Take note of the force on its way, and bring the state to the next sample, x̂[j+1|j].
+
+    `force` is what the drive will apply: after saturation and after rounding to its unit.
+    """
+    n = estimator.delay_periods
+    committed = estimator.committed
+    y, v = _hold(estimator.before[0], estimator.y, estimator.v, committed[n] + estimator.d)
+    for age in range(MAX_DELAY, 0, -1):
+        committed[age] = committed[age - 1]
+    committed[0] = force
+    estimator.y, estimator.v = _hold(estimator.after[0], y, v, committed[n] + estimator.d)

@@ -1,0 +1,83 @@
+"""What a law sees and how it is called: the record `WALL` and the decorator `law`.
+
+One sign everywhere: y < 0 is inside the wall, a force f > 0 pushes the operator out. A law reads
+the record and returns f; it does not clamp to the drive's limits and does not round.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import cfunc, from_dtype, types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from canwall.physics import zoh
+
+#: One wall as a law sees it. Units: rad or m, s, N·m or N and their quotients.
+WALL = np.dtype(
+    [
+        # The wall to be rendered.
+        ("stiffness", "f8"),
+        ("damping", "f8"),
+        # The model of what moves: m·ÿ + b·ẏ + k_h·y = f + d, held over one period T.
+        ("mass", "f8"),
+        ("viscous", "f8"),
+        ("spring", "f8"),
+        ("period", "f8"),
+        ("phi", "f8", (2, 2)),
+        ("gamma", "f8", (2,)),
+        # Position as sampled, and its backward difference: what a law without a model has.
+        ("y_sample", "f8"),
+        ("v_sample", "f8"),
+        # State at the instant at which the force takes effect, and the bias force: what a
+        # model-based law works on.
+        ("y", "f8"),
+        ("v", "f8"),
+        ("d", "f8"),
+        # What a law wants to remember from one sample to the next; zero at its first call.
+        ("memory", "f8", (16,)),
+    ],
+    align=True,
+)
+WALL_TYPE = from_dtype(WALL)
+
+#: Signature of every law: record in, force out.
+LAW_SIGNATURE = types.float64(WALL_TYPE)
+
+
+def law(function: Callable[[Any], float]) -> Any:
+    """Compile a function of one WALL record into a law that compiled code calls by address.
+
+    The address stands in a record, so laws can be exchanged between two cycles without touching
+    the code that calls them. Returns numba's CFunc. Raises numba's TypingError where the function
+    is not within what numba compiles.
+    """
+    return cfunc(LAW_SIGNATURE, cache=True, error_model="numpy")(function)
+
+
+@intrinsic
+def call_law(typingctx: Any, address: Any, wall: Any) -> Any:
+    """Force of the law at `address` for one record of dtype WALL; from compiled code only."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        record = context.get_value_type(wall)
+        function = ir.FunctionType(ir.DoubleType(), [record])
+        return builder.call(builder.inttoptr(args[0], function.as_pointer()), [args[1]])
+
+    return types.float64(types.uint64, wall), codegen
+
+
+def set_plant(
+    wall: NDArray[np.void], mass: float, viscous: float, spring: float, period: float
+) -> None:
+    """Write the model of what moves and its ZOH equivalent into a WALL array of shape (1,)."""
+    for name, value in (
+        ("mass", mass),
+        ("viscous", viscous),
+        ("spring", spring),
+        ("period", period),
+    ):
+        wall[name] = value
+    wall["phi"], wall["gamma"] = zoh(mass, viscous, spring, period)
