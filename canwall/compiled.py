@@ -17,3 +17,16 @@ def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Compile with numba: kept on disk, free of the interpreter lock, division as in IEEE 754."""
     result: Callable[_P, _R] = njit(cache=True, nogil=True, error_model="numpy")(function)
     return result
+
+
+def data_to_number(data: bytes | bytearray) -> int:
+    """Data of a CAN frame as the 64-bit number that compiled code works on.
+
+    Little-endian, missing bytes zero; signed, because that is what a Python int becomes there.
+    """
+    return int.from_bytes(data.ljust(8, b"\0"), "little", signed=True)
+
+
+def number_to_data(number: int, length: int) -> bytes:
+    """The first `length` bytes that such a number stands for."""
+    return number.to_bytes(8, "little", signed=True)[:length]

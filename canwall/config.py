@@ -22,9 +22,11 @@ from pydantic import (
     model_validator,
 )
 
+from canwall.errors import InputError
 
-class ConfigError(ValueError):
-    """A configuration that cannot be used; the text is one line for the user."""
+
+class ConfigError(InputError):
+    """A configuration that cannot be used."""
 
 
 class _Section(BaseModel):

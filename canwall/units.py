@@ -42,22 +42,14 @@ class DriveUnits:
         return self.rated_torque_nm / 1000.0
 
     @classmethod
-    def from_objects(
-        cls,
-        increments: int,
-        revolutions: int,
-        gear_motor_revolutions: int,
-        gear_shaft_revolutions: int,
-        rated_torque_mnm: int,
+    def behind_gear(
+        cls, counts_per_motor_rev: float, motor_rated_torque_nm: float, gear_ratio: float
     ) -> "DriveUnits":
-        """From 0x608F:01/:02 (encoder), 0x6091:01/:02 (gear) and 0x6076 (rated torque, mN·m).
+        """From the motor's scales (0x608F, 0x6076) and its turns per turn of the shaft (0x6091).
 
-        0x6076 is the motor's; behind a gear the handle feels it times the ratio.
+        The encoder and the rated torque are the motor's; the handle is behind the gear.
         """
-        if min(increments, revolutions, gear_motor_revolutions, gear_shaft_revolutions) <= 0:
-            raise ValueError("0x608F and 0x6091 have to be positive")
-        gear = gear_motor_revolutions / gear_shaft_revolutions
-        return cls(increments / revolutions * gear, rated_torque_mnm / 1000.0 * gear)
+        return cls(counts_per_motor_rev * gear_ratio, motor_rated_torque_nm * gear_ratio)
 
 
 @compiled

@@ -4,11 +4,12 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
+from canwall.errors import InputError
 from canwall.walls import damped, half_sample, midpoint, standard
 
 
-class UnknownLawError(ValueError):
-    """A name under which no law is known; the text is one line for the user."""
+class UnknownLawError(InputError):
+    """A name under which no law is known."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,190 @@
+"""The commands, thin: options in, one call, tables and error lines out."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+from can import CanError
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from canwall import config
+from canwall.config import ConfigError, Settings
+from canwall.errors import InputError, RunFailedError
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="A stiff virtual wall without chatter on a CANopen servo drive.",
+)
+
+#: Exit codes: a run that failed or tripped, bad input, and Ctrl-C with the drive disabled.
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+
+_console = Console()
+_errors = Console(stderr=True, soft_wrap=True, highlight=False)
+
+_ConfigArgument = Annotated[
+    Path | None, typer.Argument(metavar="[CONFIG]", help="A TOML file; without: config/sim.toml.")
+]
+
+
+def _settings(path: Path | None, **overrides: Any) -> Settings:
+    """The settings of a file, with what was given on the command line instead."""
+    dotted = {
+        key.replace("__", "."): value for key, value in overrides.items() if value is not None
+    }
+    return config.load(path or config.shipped("config/sim.toml"), dotted)
+
+
+@app.command()
+def run(
+    config_file: _ConfigArgument = None,
+    law: Annotated[str | None, typer.Option(help="Law of the wall.")] = None,
+    stiffness: Annotated[float | None, typer.Option(help="Stiffness [N·m/rad].")] = None,
+    damping: Annotated[float | None, typer.Option(help="Damping [N·m·s/rad].")] = None,
+    duration: Annotated[float | None, typer.Option(help="Seconds; without: until Ctrl-C.")] = None,
+    output: Annotated[Path | None, typer.Option(help="Folder of the run's record.")] = None,
+) -> int:
+    """Render the wall: enable the drive, run, record, disable it again.
+
+    --law also ends the changes of law that the file schedules.
+    """
+    settings = _settings(
+        config_file,
+        wall__law=law,
+        wall__stiffness_nm_per_rad=stiffness,
+        wall__damping_nm_s_per_rad=damping,
+        run__duration_s=duration,
+    )
+    if law is not None:
+        kept = tuple(change.model_copy(update={"law": None}) for change in settings.schedule)
+        settings = settings.model_copy(update={"schedule": kept})
+    from canwall.run import run as run_wall  # numba takes a second to load: not for --help
+
+    with _RunProgress() as shown:
+        result = run_wall(settings, output, shown.report, shown.advance)
+    _console.print(_strike_table(result.summary["strikes"]))
+    _console.print(f"record: {result.folder.path}", soft_wrap=True, highlight=False)
+    for note in result.notes:
+        _error(note)
+    for trip in result.outcome.trips:
+        _error(trip)
+    if result.outcome.trips or result.notes:
+        return FAILED
+    return INTERRUPTED if result.outcome.interrupted else 0
+
+
+@app.command()
+def drive(config_file: _ConfigArgument = None) -> int:
+    """A simulated drive, alone on the bus of CONFIG, until stopped."""
+    settings = _settings(config_file)
+    if settings.bus.interface == "virtual":
+        raise ConfigError(
+            "bus.interface = 'virtual' ends at this process, so nobody could reach the drive; "
+            "use 'unixcan' or 'socketcan' (see config/unixcan.toml)"
+        )
+    from canwall.run import serve_drive, stop_on_signals
+
+    with stop_on_signals() as stop:
+        _console.print(
+            f"simulated drive, node {settings.drive.node_id}, "
+            f"on {settings.bus.interface} {settings.bus.channel}; Ctrl-C ends it",
+            soft_wrap=True,
+            highlight=False,
+        )
+        serve_drive(settings, stop)
+    return 0
+
+
+@app.command()
+def plot(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")],
+) -> int:
+    """Draw the picture of a recorded run again."""
+    from canwall.plots import plot_run
+    from canwall.record import RunFolder
+
+    _console.print(str(plot_run(RunFolder(folder))), soft_wrap=True, highlight=False)
+    return 0
+
+
+class _RunProgress:
+    """Progress of a run: what is being done, then seconds of bus time."""
+
+    def __init__(self) -> None:
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.fields[clock]}"),
+            TimeRemainingColumn(),
+            console=_errors,
+        )
+        self._task = self._progress.add_task("preparing", total=None, clock="")
+
+    def __enter__(self) -> "_RunProgress":
+        self._progress.start()
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self._progress.stop()
+
+    def report(self, what: str) -> None:
+        self._progress.update(self._task, description=what)
+
+    def advance(self, now_s: float, end_s: float | None) -> None:
+        clock = f"{now_s:.1f} s" if end_s is None else f"{now_s:.1f} of {end_s:g} s"
+        self._progress.update(self._task, completed=now_s, total=end_s, clock=clock)
+
+
+def _strike_table(strikes: list[dict[str, Any]]) -> Table:
+    table = Table(title="Strikes", title_justify="left")
+    for heading in ("#", "law", "K [N·m/rad]", "contacts", "peak penetration [mrad]"):
+        table.add_column(heading, justify="left" if heading == "law" else "right")
+    table.add_column("energy out [mJ]", justify="right")
+    table.add_column("chatter")
+    for number, strike in enumerate(strikes, start=1):
+        chatter = "no"
+        if strike["chatter"]:
+            chatter = f"yes, {strike['chatter_frequency_hz']:.0f} Hz"
+        table.add_row(
+            str(number),
+            strike["law"],
+            f"{strike['stiffness']:g}",
+            str(strike["contacts"]),
+            f"{strike['peak_penetration_rad'] * 1e3:.2f}",
+            f"{strike['energy_out_j'] * 1e3:.2f}",
+            chatter,
+        )
+    return table
+
+
+def _error(text: str) -> None:
+    _errors.print(f"canwall: {text}", markup=False)
+
+
+def main() -> NoReturn:
+    """Entry point of the command `canwall`; ends the process with the exit code."""
+    sys.exit(_guarded(lambda: app(standalone_mode=False)))
+
+
+def _guarded(command: Callable[[], object]) -> int:
+    """Every error as one line; a traceback is a bug."""
+    try:
+        result = command()
+    except (KeyboardInterrupt, typer.Abort):
+        return INTERRUPTED
+    except typer.TyperException as error:
+        _error(error.format_message())
+        return BAD_INPUT
+    except InputError as error:
+        _error(str(error))
+        return BAD_INPUT
+    except (RunFailedError, CanError) as error:
+        _error(str(error))
+        return FAILED
+    return result if isinstance(result, int) else 0

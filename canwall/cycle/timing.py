@@ -1,0 +1,52 @@
+"""Durations of the cycle in histograms of fixed size: nothing is allocated while they fill.
+
+Buckets are as fine as 1/32 of their value (a power of two, cut into 32), from 1 ns to 16 s.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canwall.compiled import compiled
+
+_SUB_BITS = 5
+_SUB = 1 << _SUB_BITS
+_OCTAVES = 30
+
+#: Counts per bucket, and the exact maximum.
+HISTOGRAM = np.dtype([("counts", "u8", (_OCTAVES * _SUB,)), ("largest_ns", "i8")], align=True)
+
+
+@compiled
+def observe_ns(histograms: NDArray[np.void], duration_ns: int) -> None:
+    """Count one duration into a HISTOGRAM array of shape (1,)."""
+    histogram = histograms[0]
+    value = max(duration_ns, 0)
+    histogram.largest_ns = max(histogram.largest_ns, value)
+    octave = 0
+    while value >= 2 * _SUB:
+        value >>= 1
+        octave += 1
+    # Below 2·_SUB every value has its own bucket; each octave above adds _SUB.
+    bucket = min(octave * _SUB + value, _OCTAVES * _SUB - 1)
+    histogram.counts[bucket] += 1
+
+
+def percentile_ns(histogram: NDArray[np.void], percent: float) -> float:
+    """The duration that `percent` of those counted do not exceed, to 1/32; 0 of none."""
+    counts = histogram["counts"][0]
+    total = int(counts.sum())
+    if total == 0:
+        return 0.0
+    bucket = int(np.searchsorted(np.cumsum(counts), np.ceil(total * percent / 100.0)))
+    octave = max(bucket // _SUB - 1, 0)
+    upper = float((bucket - octave * _SUB + 1) << octave) - 1.0
+    return min(upper, float(histogram["largest_ns"][0]))
+
+
+def timing_summary(histogram: NDArray[np.void]) -> dict[str, float]:
+    """p50, p99, p99.9 and max in microseconds."""
+    summary = {
+        f"p{percent:g}_us": percentile_ns(histogram, percent) / 1e3 for percent in (50, 99, 99.9)
+    }
+    summary["max_us"] = float(histogram["largest_ns"][0]) / 1e3
+    return summary

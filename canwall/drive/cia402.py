@@ -1,0 +1,76 @@
+"""The CiA 402 state machine from the master's side: which controlword leads where.
+
+Pure functions of the statusword, so they serve a cycle as well as a set-up over SDO.
+"""
+
+from enum import Enum, IntEnum
+
+
+class State(Enum):
+    """States of the power drive system (CiA 402-2), with mask and value of the statusword."""
+
+    NOT_READY_TO_SWITCH_ON = (0x4F, 0x00)
+    SWITCH_ON_DISABLED = (0x4F, 0x40)
+    READY_TO_SWITCH_ON = (0x6F, 0x21)
+    SWITCHED_ON = (0x6F, 0x23)
+    OPERATION_ENABLED = (0x6F, 0x27)
+    QUICK_STOP_ACTIVE = (0x6F, 0x07)
+    FAULT_REACTION_ACTIVE = (0x4F, 0x0F)
+    FAULT = (0x4F, 0x08)
+
+    def __str__(self) -> str:
+        return self.name.replace("_", " ")
+
+
+class Controlword(IntEnum):
+    """Commands of 0x6040."""
+
+    DISABLE_VOLTAGE = 0x00
+    QUICK_STOP = 0x02
+    SHUTDOWN = 0x06
+    SWITCH_ON = 0x07
+    ENABLE_OPERATION = 0x0F
+    FAULT_RESET = 0x80
+
+
+def state_of(statusword: int) -> State:
+    """The state that a statusword (0x6041) shows."""
+    for state in State:
+        mask, value = state.value
+        if statusword & mask == value:
+            return state
+    return State.NOT_READY_TO_SWITCH_ON  # the masks leave no other; a drive starting up shows it
+
+
+_UP = {
+    State.NOT_READY_TO_SWITCH_ON: Controlword.DISABLE_VOLTAGE,
+    State.SWITCH_ON_DISABLED: Controlword.SHUTDOWN,
+    State.READY_TO_SWITCH_ON: Controlword.SWITCH_ON,
+    State.SWITCHED_ON: Controlword.ENABLE_OPERATION,
+    State.OPERATION_ENABLED: Controlword.ENABLE_OPERATION,
+    # Transition 16 back to OPERATION ENABLED is optional; through SWITCH ON DISABLED every drive
+    # goes.
+    State.QUICK_STOP_ACTIVE: Controlword.DISABLE_VOLTAGE,
+    State.FAULT_REACTION_ACTIVE: Controlword.DISABLE_VOLTAGE,
+    State.FAULT: Controlword.FAULT_RESET,
+}
+
+_DOWN = {
+    State.OPERATION_ENABLED: Controlword.SWITCH_ON,  # transition 5, disable operation
+    State.SWITCHED_ON: Controlword.SHUTDOWN,
+}
+
+
+def controlword_up(state: State, previous: int) -> int:
+    """Next controlword on the way to OPERATION ENABLED, from any state.
+
+    The fault reset acts on the rising edge of bit 7, so it alternates with a word without it.
+    """
+    if state is State.FAULT and previous & Controlword.FAULT_RESET:
+        return Controlword.DISABLE_VOLTAGE
+    return _UP[state]
+
+
+def controlword_down(state: State) -> int:
+    """Next controlword on the way to SWITCH ON DISABLED, from any state, step by step."""
+    return _DOWN.get(state, Controlword.DISABLE_VOLTAGE)

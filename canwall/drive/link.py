@@ -1,0 +1,142 @@
+"""One bus for everything the master says and hears: cycle, SDO, NMT, EMCY, in one thread.
+
+canopen's Network usually receives in a thread of its own, which costs the cycle its timing.
+Here whoever waits for a frame reads the bus, and hands what is not his to the network; so SDO
+transfers and the cycle need no lock and no second thread.
+"""
+
+import time
+from collections.abc import Callable
+
+import can
+import canopen
+from canopen.sdo import SdoClient
+from canopen.sdo.exceptions import SdoCommunicationError
+
+#: Takes note of a frame: time [s], message, whether it was received (else sent).
+FrameLog = Callable[[float, can.Message, bool], None]
+
+
+class Link:
+    """A python-can bus with canopen's network on it.
+
+    idle: what to do while nothing is waiting on the bus, instead of blocking. An embedded
+    simulated drive lives in these moments.
+    """
+
+    def __init__(self, bus: can.BusABC, idle: Callable[[], None] | None = None) -> None:
+        self._bus = bus
+        self._idle = idle
+        self.log: FrameLog | None = None
+        self.network = _Network(self)
+
+    def send(self, message: can.Message) -> None:
+        """Send and take note of it. Raises can.CanError."""
+        self._bus.send(message)
+        if self.log is not None:
+            self.log(time.time(), message, False)
+
+    def receive(self, timeout_s: float) -> can.Message | None:
+        """The next frame, or None if there is none within the time. Raises can.CanError."""
+        if self._idle is None:
+            message = self._bus.recv(timeout_s)
+        else:
+            message = self._receive_idling(timeout_s)
+        if message is not None and self.log is not None:
+            self.log(message.timestamp, message, True)
+        return message
+
+    def _receive_idling(self, timeout_s: float) -> can.Message | None:
+        assert self._idle is not None
+        deadline = time.monotonic() + timeout_s
+        while True:
+            message = self._bus.recv(0)
+            if message is not None or time.monotonic() >= deadline:
+                return message
+            self._idle()
+
+    def wait_for(self, can_id: int, timeout_s: float) -> can.Message | None:
+        """The next data frame with this identifier; what comes before it goes to the network."""
+        deadline = time.monotonic() + timeout_s
+        remaining = timeout_s
+        while True:
+            message = self.receive(remaining)
+            if message is None:
+                return None
+            if message.arbitration_id == can_id and not (
+                message.is_remote_frame or message.is_error_frame
+            ):
+                return message
+            self.dispatch(message)
+            remaining = max(0.0, deadline - time.monotonic())
+
+    def dispatch(self, message: can.Message) -> None:
+        """Hand a frame to canopen (SDO answers, heartbeats, EMCY)."""
+        if not (message.is_remote_frame or message.is_error_frame):
+            self.network.notify(message.arbitration_id, message.data, message.timestamp)
+
+    def serve(self, timeout_s: float) -> bool:
+        """Take one frame for the network; whether there was one within the time."""
+        message = self.receive(timeout_s)
+        if message is not None:
+            self.dispatch(message)
+        return message is not None
+
+    def add_node(self, node_id: int, dictionary: canopen.ObjectDictionary) -> canopen.RemoteNode:
+        """A remote node whose SDO transfers read this link."""
+        return self.network.add_node(_Node(node_id, dictionary, self))
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._bus.shutdown()
+
+
+class _Network(canopen.Network):  # type: ignore[misc]
+    """canopen's network without a receive thread: its frames go through the link."""
+
+    def __init__(self, link: Link) -> None:
+        super().__init__()
+        self._link = link
+
+    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        self._link.send(
+            can.Message(
+                arbitration_id=can_id,
+                data=data,
+                is_remote_frame=remote,
+                is_extended_id=can_id > 0x7FF,
+            )
+        )
+
+
+class _Node(canopen.RemoteNode):  # type: ignore[misc]
+    """A remote node with SDO clients that read the link."""
+
+    def __init__(self, node_id: int, dictionary: canopen.ObjectDictionary, link: Link) -> None:
+        self._link = link
+        super().__init__(node_id, dictionary)
+
+    def add_sdo(self, rx_cobid: int, tx_cobid: int) -> SdoClient:
+        client = _Sdo(rx_cobid, tx_cobid, self.object_dictionary, self._link)
+        self.sdo_channels.append(client)
+        if self.has_network():
+            self.network.subscribe(client.tx_cobid, client.on_response)
+        return client
+
+
+class _Sdo(SdoClient):  # type: ignore[misc]
+    """canopen's SDO client, reading the bus itself while it waits."""
+
+    def __init__(self, rx: int, tx: int, dictionary: canopen.ObjectDictionary, link: Link) -> None:
+        super().__init__(rx, tx, dictionary)
+        self._link = link
+
+    def read_response(self) -> bytes:
+        deadline = time.monotonic() + self.RESPONSE_TIMEOUT
+        while self.responses.empty():
+            remaining = deadline - time.monotonic()
+            if remaining <= 0.0:
+                raise SdoCommunicationError("No SDO response received")
+            self._link.serve(remaining)
+        response: bytes = super().read_response()
+        return response

@@ -1,0 +1,21 @@
+"""What a run leaves behind: one row per cycle, every frame, and a summary.
+
+The cycle writes into a ring in shared memory and never waits for a disk; a process of its own
+(`writer`) empties the ring into the run's folder, and completes the files even if the master dies.
+"""
+
+from canwall.record.folder import RunFolder, read_signals
+from canwall.record.recorder import Recorder, RecordError
+from canwall.record.ring import FRAME, ROW, TIMING_COLUMNS, Phase, Ring
+
+__all__ = [
+    "FRAME",
+    "ROW",
+    "TIMING_COLUMNS",
+    "Phase",
+    "RecordError",
+    "Recorder",
+    "Ring",
+    "RunFolder",
+    "read_signals",
+]

@@ -1,0 +1,209 @@
+"""The rows of a record, and the ring in shared memory that carries them to the writer.
+
+One writer and one reader for each of the two rings (cycles and frames). Each side owns one
+counter: the head counts what was put in, the tail what was taken out; neither ever runs back.
+"""
+
+import mmap
+import os
+from enum import IntEnum
+
+import can
+import numpy as np
+from numpy.typing import NDArray
+
+from canwall.compiled import Record, compiled, data_to_number, number_to_data
+
+
+class Phase(IntEnum):
+    """What a cycle was for."""
+
+    ENABLING = 0
+    RENDERING = 1
+    LEAVING = 2
+
+
+#: One cycle, as `signals.parquet` has it. Positions and torques with a sign of the drive's axis
+#: say so; y and force are the wall's (y < 0 inside, force > 0 out of it).
+ROW = np.dtype(
+    [
+        ("j", "i8"),  # SYNC count
+        ("t_s", "f8"),  # j times the cycle, from the first SYNC on
+        ("phase", "u1"),  # Phase
+        ("received", "?"),  # whether this SYNC's TPDO came in time
+        ("counts", "i4"),  # 0x6064
+        ("statusword", "u2"),  # 0x6041
+        ("controlword", "u2"),  # 0x6040 as sent
+        ("position_rad", "f8"),  # of the drive's axis
+        ("y", "f8"),  # relative to the wall, as sampled
+        ("y_est", "f8"),  # at the instant of actuation
+        ("v_est", "f8"),
+        ("d_est", "f8"),  # estimated bias force
+        ("force", "f8"),  # what the law wants from the instant of actuation on
+        ("torque_cmd_per_mille", "i2"),  # 0x6071 as sent
+        ("torque_cmd", "f8"),  # the same in N·m, drive's axis
+        ("torque_applied", "f8"),  # in force from this SYNC on [N·m], drive's axis
+        ("force_applied", "f8"),  # the same, out of the wall
+        ("law", "u1"),  # index into the laws of the run
+        ("stiffness", "f8"),
+        ("damping", "f8"),
+        ("wall_position_rad", "f8"),
+        ("sync_interval_s", "f8"),  # since the SYNC before, by the clock
+        ("latency_s", "f8"),  # from the TPDO's reception to the RPDO's sending
+    ],
+    align=True,
+)
+
+#: Columns that the clock of the machine decides; all others are the same from run to run.
+TIMING_COLUMNS = ("sync_interval_s", "latency_s")
+
+_RECEIVED, _REMOTE, _ERROR, _EXTENDED = 1, 2, 4, 8
+
+#: One frame on the bus, as the master saw or sent it.
+FRAME = np.dtype(
+    [
+        ("time_s", "f8"),
+        ("can_id", "u4"),
+        ("flags", "u1"),
+        ("length", "u1"),
+        ("data", "i8"),  # as data_to_number gives it
+    ],
+    align=True,
+)
+
+_HEADER = np.dtype(
+    [
+        ("row_head", "i8"),
+        ("row_tail", "i8"),
+        ("rows_lost", "i8"),
+        ("frame_head", "i8"),
+        ("frame_tail", "i8"),
+        ("frames_lost", "i8"),
+    ],
+    align=True,
+)
+
+#: Capacity in cycles and frames: 16 s at 1 kHz, longer than a disk usually sulks.
+ROWS = 1 << 14
+FRAMES = 1 << 16
+
+
+class Ring:
+    """Both rings in one piece of shared memory, to be handed to another process by descriptor."""
+
+    def __init__(self, descriptor: int) -> None:
+        self.descriptor = descriptor
+        self._memory = mmap.mmap(descriptor, self.size())
+        self.header = np.frombuffer(self._memory, _HEADER, 1)
+        offset = self._offsets()
+        self.rows = np.frombuffer(self._memory, ROW, ROWS, offset[0])
+        self.frames = np.frombuffer(self._memory, FRAME, FRAMES, offset[1])
+
+    @classmethod
+    def create(cls) -> "Ring":
+        """A new, empty ring."""
+        descriptor = os.memfd_create("canwall-record")
+        os.ftruncate(descriptor, cls.size())
+        return cls(descriptor)
+
+    @staticmethod
+    def _offsets() -> tuple[int, int, int]:
+        rows = 64
+        frames = rows + ROWS * ROW.itemsize
+        return rows, frames, frames + FRAMES * FRAME.itemsize
+
+    @classmethod
+    def size(cls) -> int:
+        """Bytes of shared memory."""
+        return cls._offsets()[2]
+
+    def log_frame(self, time_s: float, message: can.Message, received: bool) -> None:
+        """Note a frame (a `drive.FrameLog`)."""
+        flags = (
+            _RECEIVED * received
+            | _REMOTE * message.is_remote_frame
+            | _ERROR * message.is_error_frame
+            | _EXTENDED * message.is_extended_id
+        )
+        put_frame(
+            self.header,
+            self.frames,
+            time_s,
+            message.arbitration_id,
+            flags,
+            message.dlc,
+            data_to_number(message.data),
+        )
+
+    def backlog(self) -> float:
+        """How full the fuller of the two rings is, 0 … 1."""
+        header = self.header[0]
+        rows = (header["row_head"] - header["row_tail"]) / ROWS
+        frames = (header["frame_head"] - header["frame_tail"]) / FRAMES
+        return float(max(rows, frames))
+
+    def take_rows(self) -> NDArray[np.void]:
+        """Reader: all rows that are waiting, copied out; shape (n,), dtype ROW."""
+        return self._take(self.rows, "row_head", "row_tail")
+
+    def take_frames(self) -> NDArray[np.void]:
+        """Reader: all frames that are waiting, copied out; shape (n,), dtype FRAME."""
+        return self._take(self.frames, "frame_head", "frame_tail")
+
+    def _take(self, ring: NDArray[np.void], head: str, tail: str) -> NDArray[np.void]:
+        start, stop = int(self.header[tail][0]), int(self.header[head][0])
+        taken = ring[np.arange(start, stop) % len(ring)]
+        self.header[tail] = stop
+        return taken
+
+
+def to_message(frame: NDArray[np.void], channel: str) -> can.Message:
+    """A FRAME as python-can's message."""
+    flags, length = int(frame["flags"]), int(frame["length"])
+    remote = bool(flags & _REMOTE)
+    return can.Message(
+        timestamp=float(frame["time_s"]),
+        arbitration_id=int(frame["can_id"]),
+        is_extended_id=bool(flags & _EXTENDED),
+        is_remote_frame=remote,
+        is_error_frame=bool(flags & _ERROR),
+        is_rx=bool(flags & _RECEIVED),
+        dlc=length,
+        data=None if remote else number_to_data(int(frame["data"]), length),
+        channel=channel,
+    )
+
+
+@compiled
+def put_frame(
+    headers: NDArray[np.void],
+    frames: NDArray[np.void],
+    time_s: float,
+    can_id: int,
+    flags: int,
+    length: int,
+    data: int,
+) -> None:
+    """Writer: append a frame, or count it as lost where the reader is too far behind."""
+    header: Record = headers[0]
+    if header.frame_head - header.frame_tail >= len(frames):
+        header.frames_lost += 1
+        return
+    frame: Record = frames[header.frame_head % len(frames)]
+    frame.time_s = time_s
+    frame.can_id = can_id
+    frame.flags = flags
+    frame.length = length
+    frame.data = data
+    header.frame_head += 1
+
+
+@compiled
+def put_row(headers: NDArray[np.void], ring: NDArray[np.void], rows: NDArray[np.void]) -> None:
+    """Writer: append a row (array of shape (1,)), or count it as lost."""
+    header: Record = headers[0]
+    if header.row_head - header.row_tail >= len(ring):
+        header.rows_lost += 1
+        return
+    ring[header.row_head % len(ring)] = rows[0]
+    header.row_head += 1

@@ -1,0 +1,24 @@
+"""A CiA 402 servo drive that exists on the CAN bus alone: frames in, frames out."""
+
+from canwall.simdrive.axis import Motion
+from canwall.simdrive.build import make_drive
+from canwall.simdrive.dictionary import Dictionary, DictionaryError
+from canwall.simdrive.drive import SimulatedDrive
+from canwall.simdrive.frame import Frame
+from canwall.simdrive.hand import hand_path
+from canwall.simdrive.motion import ServoMotion, hand_force, hand_plant
+from canwall.simdrive.runner import BusRunner
+
+__all__ = [
+    "BusRunner",
+    "Dictionary",
+    "DictionaryError",
+    "Frame",
+    "Motion",
+    "ServoMotion",
+    "SimulatedDrive",
+    "hand_force",
+    "hand_path",
+    "hand_plant",
+    "make_drive",
+]

@@ -1,0 +1,161 @@
+"""The CiA 402 side of the drive: controlword and mode in, statusword, torque and position out."""
+
+from typing import Protocol
+
+from canwall.simdrive.dictionary import Dictionary, Key
+from canwall.simdrive.emcy import EmergencyProducer
+from canwall.simdrive.state_machine import Command, State, StateMachine
+
+NO_MODE = 0
+CYCLIC_SYNCHRONOUS_TORQUE = 10
+
+_HALT = 1 << 8  # controlword
+
+# Statusword; bit 10 is reserved in cyclic synchronous torque mode.
+_VOLTAGE_ENABLED = 1 << 4
+_REMOTE = 1 << 9
+_INTERNAL_LIMIT_ACTIVE = 1 << 11
+_FOLLOWS_TARGET = 1 << 12
+
+# Abort connection option code (0x6007)
+_NO_ACTION, _FAULT, _DISABLE_VOLTAGE, _QUICK_STOP = range(4)
+
+_INT32 = 1 << 31
+_PER_MILLE_MILLI = 1e6
+"""Per mille of a rated torque in mN m, to N m."""
+
+
+class Motion(Protocol):
+    """What motor, encoder and hand present to the drive."""
+
+    def counts(self) -> int:
+        """Return the encoder position in increments; the drive shows its low 32 bits."""
+        ...
+
+    def speed_counts_per_s(self) -> float:
+        """Return the velocity in increments per second."""
+        ...
+
+    def advance(self, torque_nm: float, duration_s: float) -> None:
+        """Move on by ``duration_s`` under a motor torque that is constant meanwhile."""
+        ...
+
+
+class Axis:
+    """State machine, mode of operation, torque path and measured values of the one axis."""
+
+    def __init__(self, dictionary: Dictionary, motion: Motion, emcy: EmergencyProducer) -> None:
+        """Serve the 0x6000 objects of the dictionary.
+
+        Raises:
+            DictionaryError: one of them is not an integer.
+        """
+        self._motion = motion
+        self._emcy = emcy
+        number = dictionary.number
+        self._abort_option = number(0x6007, absent=_FAULT)
+        self._controlword = number(0x6040, absent=0)
+        self._statusword = number(0x6041, absent=0)
+        self._mode = number(0x6060, absent=NO_MODE)
+        self._mode_display = number(0x6061, absent=NO_MODE)
+        self._position = number(0x6064, absent=0)
+        self._velocity = number(0x606C, absent=0)
+        self._target_torque = number(0x6071, absent=0)
+        self._max_torque = number(0x6072, absent=_INT32)
+        self._rated_torque = number(0x6076, absent=0)
+        self._actual_torque = number(0x6077, absent=0)
+        self._positive_limit = number(0x60E0, absent=_INT32)
+        self._negative_limit = number(0x60E1, absent=_INT32)
+        self._follows_target = False
+        self._limited = False
+        self._halt = False
+        self.state_machine = StateMachine(dictionary, self._refresh)
+        self._abort_option.allow((_NO_ACTION, _FAULT, _DISABLE_VOLTAGE, _QUICK_STOP))
+        self._mode.allow((NO_MODE, CYCLIC_SYNCHRONOUS_TORQUE)).react = lambda _: self._refresh()
+        self._controlword.react = self._control
+
+    def reset(self) -> None:
+        """Begin in NOT READY TO SWITCH ON, with the objects as they stand."""
+        self._halt = False
+        self.state_machine.reset()
+        self.sample()
+
+    def disable(self) -> None:
+        """Take the torque away at once, whatever the state."""
+        self.state_machine.command(Command.DISABLE_VOLTAGE)
+
+    def abort_connection(self, code: int, source: Key) -> None:
+        """React to a lost master as 0x6007 says, if the drive function is on.
+
+        Args:
+            code: error code, for the fault.
+            source: (index, sub-index) of the object that noticed.
+        """
+        if not self.state_machine.powered:
+            return
+        option = self._abort_option.value
+        if option == _FAULT:
+            self._emcy.occurred(code, source)
+            self._emcy.latched = True
+            self.state_machine.fault()
+        elif option == _DISABLE_VOLTAGE:
+            self.state_machine.command(Command.DISABLE_VOLTAGE)
+        elif option == _QUICK_STOP:
+            self.state_machine.command(Command.QUICK_STOP)
+
+    def apply_torque(self) -> float:
+        """Let the target torque take effect; return the torque that applies from now, in N m."""
+        actual = 0
+        limited = False
+        if self._follows_target:
+            target = self._target_torque.value
+            limit = self._max_torque.value
+            highest = min(limit, self._positive_limit.value)
+            lowest = -min(limit, self._negative_limit.value)
+            actual = max(lowest, min(highest, target))
+            limited = actual != target
+        self._actual_torque.value = actual
+        if limited is not self._limited:
+            self._limited = limited
+            self._show_status()
+        torque_nm: float = actual * self._rated_torque.value / _PER_MILLE_MILLI
+        return torque_nm
+
+    def sample(self) -> None:
+        """Latch position and velocity."""
+        self._position.value = (self._motion.counts() + _INT32) % (2 * _INT32) - _INT32
+        speed = round(self._motion.speed_counts_per_s())
+        self._velocity.value = max(-_INT32, min(_INT32 - 1, speed))
+
+    def _control(self, controlword: int) -> None:
+        halt = bool(controlword & _HALT)
+        if halt is not self._halt:
+            self._halt = halt
+            self._refresh()
+        self.state_machine.control(controlword)
+
+    def _refresh(self) -> None:
+        """Follow a change of state, mode or halt."""
+        self._mode_display.value = self._mode.value
+        self._follows_target = (
+            self.state_machine.state is State.OPERATION_ENABLED
+            and self._mode.value == CYCLIC_SYNCHRONOUS_TORQUE
+            and not self._halt
+        )
+        if not self._follows_target:
+            self._actual_torque.value = 0
+            self._limited = False
+        if self._emcy.latched and not self.state_machine.faulty:
+            self._emcy.acknowledge()
+        self._show_status()
+
+    def _show_status(self) -> None:
+        state = self.state_machine.state
+        status: int = state.value
+        if state is not State.NOT_READY_TO_SWITCH_ON:
+            status |= _VOLTAGE_ENABLED | _REMOTE
+        if self._follows_target:
+            status |= _FOLLOWS_TARGET
+        if self._limited:
+            status |= _INTERNAL_LIMIT_ACTIVE
+        self._statusword.value = status

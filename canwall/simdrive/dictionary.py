@@ -1,0 +1,316 @@
+"""The object dictionary (CiA 301, 7.4): a flat table of typed entries, from an EDS or DCF."""
+
+from collections.abc import Callable, Container, Iterator
+from configparser import Error as ConfigParserError
+from pathlib import Path
+from struct import Struct
+from typing import Any, TypeAlias
+
+import canopen
+from canopen.objectdictionary import ODVariable, datatypes
+
+from canwall.simdrive.abort import AbortCode, AccessError
+
+MANDATORY = {
+    0x1000: ("device type", datatypes.UNSIGNED32),
+    0x1001: ("error register", datatypes.UNSIGNED8),
+    0x1018: ("identity object", datatypes.UNSIGNED8),
+    0x6040: ("controlword", datatypes.UNSIGNED16),
+    0x6041: ("statusword", datatypes.UNSIGNED16),
+    0x6060: ("modes of operation", datatypes.INTEGER8),
+    0x6061: ("modes of operation display", datatypes.INTEGER8),
+    0x6064: ("position actual value", datatypes.INTEGER32),
+    0x6071: ("target torque", datatypes.INTEGER16),
+    0x6077: ("torque actual value", datatypes.INTEGER16),
+}
+"""Objects without which there is no torque drive: name and CiA 301 data type of sub-index 0."""
+
+Key: TypeAlias = tuple[int, int]
+"""(index, sub-index)."""
+
+_FIRST_OBJECT = 0x1000
+_COMMUNICATION_PROFILE = range(0x1000, 0x2000)
+
+
+class DictionaryError(ValueError):
+    """An EDS or DCF that no drive can be built from; one line, naming file and object."""
+
+
+class Entry:
+    """One sub-index: what the EDS says of it, its present value, and who watches it.
+
+    ``value`` is an int, a float or (strings and domains) bytes; None: nothing to read yet.
+    ``check`` sees a value before it is stored and raises AccessError to refuse it; ``react`` sees
+    it afterwards. Both act on writes from the bus only; the device itself assigns ``value``.
+    """
+
+    __slots__ = (
+        "access",
+        "check",
+        "codec",
+        "default",
+        "high",
+        "index",
+        "low",
+        "pdo_mapping",
+        "react",
+        "subindex",
+        "value",
+    )
+
+    def __init__(
+        self,
+        index: int,
+        subindex: int,
+        codec: Struct | None,
+        default: Any,
+        access: str = "rw",
+        pdo_mapping: bool = False,
+        low: int | None = None,
+        high: int | None = None,
+    ) -> None:
+        """Describe an entry; ``codec`` is None for strings and domains."""
+        self.index = index
+        self.subindex = subindex
+        self.codec = codec
+        self.default = default
+        self.access = access
+        self.pdo_mapping = pdo_mapping
+        self.low = low
+        self.high = high
+        self.value: Any = default
+        self.check: Callable[[Any], None] | None = None
+        self.react: Callable[[Any], None] | None = None
+
+    @property
+    def key(self) -> Key:
+        """(index, sub-index)."""
+        return self.index, self.subindex
+
+    @property
+    def size(self) -> int | None:
+        """Bytes of the value, None if it may have any length."""
+        return self.codec.size if self.codec else None
+
+    @property
+    def pdo_format(self) -> str | None:
+        """Format character for struct, None if no PDO can hold the type on byte boundaries."""
+        # canopen's codecs for 24 to 56 bits are subclasses whose format is the next wider one.
+        if type(self.codec) is not Struct or self.codec.format == "?":
+            return None
+        return self.codec.format.removeprefix("<")
+
+    @property
+    def receivable(self) -> bool:
+        """Whether an RPDO may carry it (CiA 306: rww is for process output only)."""
+        return self.pdo_mapping and self.access in ("rw", "rww", "wo")
+
+    @property
+    def transmittable(self) -> bool:
+        """Whether a TPDO may carry it (CiA 306: rwr is for process input only)."""
+        return self.pdo_mapping and self.access in ("ro", "rw", "rwr", "const")
+
+    def allow(self, values: Container[int]) -> "Entry":
+        """Let the bus write these values only; others get INVALID_VALUE. Returns the entry."""
+
+        def check(value: int) -> None:
+            if value not in values:
+                raise AccessError(AbortCode.INVALID_VALUE)
+
+        self.check = check
+        return self
+
+    def upload(self) -> bytes:
+        """Return the value as it goes over the bus.
+
+        Raises:
+            AccessError: WRITE_ONLY, NO_DATA.
+        """
+        if self.access == "wo":
+            raise AccessError(AbortCode.WRITE_ONLY)
+        if self.value is None:
+            raise AccessError(AbortCode.NO_DATA)
+        return self.codec.pack(self.value) if self.codec else bytes(self.value)
+
+    def check_download(self, size: int | None) -> None:
+        """Refuse a download that cannot succeed, before its data are here.
+
+        Args:
+            size: bytes announced, None if unknown.
+
+        Raises:
+            AccessError: READ_ONLY, TOO_LONG, TOO_SHORT.
+        """
+        if "w" not in self.access:
+            raise AccessError(AbortCode.READ_ONLY)
+        if self.codec and size is not None and size != self.codec.size:
+            raise AccessError(AbortCode.TOO_LONG if size > self.codec.size else AbortCode.TOO_SHORT)
+
+    def download(self, data: bytes) -> None:
+        """Write the value as it came over the bus.
+
+        Raises:
+            AccessError: as check_download() and write().
+        """
+        self.check_download(len(data))
+        self.write(self.codec.unpack(data)[0] if self.codec else data)
+
+    def write(self, value: Any) -> None:
+        """Write a decoded value on behalf of the bus (SDO or RPDO).
+
+        Raises:
+            AccessError: TOO_LOW, TOO_HIGH, or what the service that checks the entry raises.
+        """
+        if self.low is not None and value < self.low:
+            raise AccessError(AbortCode.TOO_LOW)
+        if self.high is not None and value > self.high:
+            raise AccessError(AbortCode.TOO_HIGH)
+        if self.check is not None:
+            self.check(value)
+        self.value = value
+        if self.react is not None:
+            self.react(value)
+
+
+class Dictionary:
+    """All entries by (index, sub-index), for one node-ID."""
+
+    def __init__(self, source: str, node_id: int, variables: Iterator[ODVariable]) -> None:
+        """Take the variables over; ``load`` is the usual way to get here.
+
+        Raises:
+            DictionaryError: a mandatory object is missing, or of the wrong type.
+        """
+        self.source = source
+        self.node_id = node_id
+        self._entries: dict[Key, Entry] = {}
+        self.dummies: dict[int, int] = {}
+        """Sizes in bytes of the data types that an RPDO may map to skip bytes ([DummyUsage])."""
+        for variable in variables:
+            if variable.index >= _FIRST_OBJECT:
+                entry = self._entry(variable)
+                self._entries[entry.key] = entry
+            elif variable.data_type != datatypes.BOOLEAN:  # a single bit: PDOs here have bytes
+                self.dummies[variable.index] = len(variable) // 8
+        self._indices = {index for index, _ in self._entries}
+        for index, (name, data_type) in MANDATORY.items():
+            if (index, 0) not in self:
+                raise self.error(index, 0, f"{name}: missing")
+            if self[index, 0].codec is not ODVariable.STRUCT_TYPES[data_type]:
+                raise self.error(index, 0, f"{name}: data type is not 0x{data_type:04X}")
+
+    @classmethod
+    def load(cls, path: str | Path, node_id: int) -> "Dictionary":
+        """Read an EDS or DCF (CiA 306); a DCF's ParameterValue is the power-on value.
+
+        Raises:
+            DictionaryError: the file cannot be read or parsed, or lacks what a drive needs.
+            ValueError: the node-ID is not in 1 to 127.
+        """
+        if not 1 <= node_id <= 127:
+            raise ValueError(f"node-ID {node_id} is not in 1 to 127")
+        try:
+            # canopen opens paths in the encoding of the locale; vendors write any.
+            with open(path, encoding="utf-8", errors="replace") as file:
+                od = canopen.import_od(file, node_id)
+        except OSError as error:
+            raise DictionaryError(f"{path}: {error.strerror}") from error
+        except (ConfigParserError, LookupError, ValueError) as error:
+            reason = " ".join(str(error).split())
+            raise DictionaryError(f"{path}: not an EDS: {reason}") from error
+        return cls(str(path), node_id, _variables(od))
+
+    def __contains__(self, key: Key) -> bool:
+        """Whether the EDS has the sub-index."""
+        return key in self._entries
+
+    def __getitem__(self, key: Key) -> Entry:
+        """Return the entry of (index, sub-index).
+
+        Raises:
+            KeyError: the EDS does not have it.
+        """
+        return self._entries[key]
+
+    def find(self, index: int, subindex: int) -> Entry:
+        """Return the entry that an SDO or a PDO mapping asks for.
+
+        Raises:
+            AccessError: NO_OBJECT, NO_SUBINDEX.
+        """
+        entry = self._entries.get((index, subindex))
+        if entry is None:
+            known = index in self._indices
+            raise AccessError(AbortCode.NO_SUBINDEX if known else AbortCode.NO_OBJECT)
+        return entry
+
+    def number(self, index: int, subindex: int = 0, *, absent: int) -> Entry:
+        """Return an integer entry that a service works with.
+
+        Args:
+            index: object index.
+            subindex: sub-index.
+            absent: what holds where the EDS does not list it; such an entry is not on the bus.
+
+        Raises:
+            DictionaryError: the EDS lists it with another data type.
+        """
+        entry = self._entries.get((index, subindex))
+        if entry is None:
+            return Entry(index, subindex, None, absent)
+        if not isinstance(entry.default, int):
+            raise self.error(index, subindex, "not an integer")
+        return entry
+
+    def indices(self, within: range) -> list[int]:
+        """Return the objects that the EDS has in a range of indices, in order."""
+        return sorted(self._indices.intersection(within))
+
+    def reset(self, *, communication_only: bool) -> None:
+        """Load the power-on values: of all objects, or of 0x1000 to 0x1FFF (CiA 301, 7.3.2.2)."""
+        for entry in self._entries.values():
+            if not communication_only or entry.index in _COMMUNICATION_PROFILE:
+                entry.value = entry.default
+
+    def error(self, index: int, subindex: int, what: str) -> DictionaryError:
+        """Return the error to raise for an object of this file."""
+        return DictionaryError(f"{self.source}: object 0x{index:04X}:{subindex:02X} {what}")
+
+    def _entry(self, variable: ODVariable) -> Entry:
+        codec = ODVariable.STRUCT_TYPES.get(variable.data_type)
+        value = variable.default if variable.value is None else variable.value
+        try:
+            default = _power_on_value(codec, value)
+        except (TypeError, ValueError, OverflowError) as error:
+            what = f"{value!r} is no value of data type 0x{variable.data_type:04X}"
+            raise self.error(variable.index, variable.subindex, what) from error
+        return Entry(
+            variable.index,
+            variable.subindex,
+            codec,
+            default,
+            variable.access_type,
+            variable.pdo_mappable,
+            variable.min if codec else None,
+            variable.max if codec else None,
+        )
+
+
+def _variables(od: canopen.ObjectDictionary) -> Iterator[ODVariable]:
+    for item in od.values():
+        if isinstance(item, ODVariable):
+            yield item
+        else:
+            yield from item.subindices.values()
+
+
+def _power_on_value(codec: Struct | None, value: Any) -> Any:
+    """Bring a value of the EDS into the entry's type; an EDS without one means zero or empty."""
+    if codec is None:
+        text = value or b""
+        return text.encode() if isinstance(text, str) else bytes(memoryview(text))
+    if isinstance(value, float):
+        return value
+    # EDS write negative numbers as -1 or, for 8 bits, 0xFF.
+    raw = (value or 0) & (1 << 8 * codec.size) - 1
+    return codec.unpack(raw.to_bytes(codec.size, "little"))[0]

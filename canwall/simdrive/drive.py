@@ -1,0 +1,194 @@
+"""The simulated drive: which service takes which frame in which NMT state, and what SYNC does."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import TypeAlias
+
+from canwall.simdrive import nmt, rpdo, tpdo
+from canwall.simdrive.axis import Axis, Motion
+from canwall.simdrive.dictionary import Dictionary, Key
+from canwall.simdrive.emcy import COMMUNICATION, HEARTBEAT_LOST, EmergencyProducer
+from canwall.simdrive.frame import Clock, Frame
+from canwall.simdrive.heartbeat import HeartbeatConsumer, HeartbeatProducer
+from canwall.simdrive.nmt import NmtSlave, NmtState
+from canwall.simdrive.rpdo import Rpdo
+from canwall.simdrive.sdo import SdoServer
+from canwall.simdrive.sync import SyncConsumer
+from canwall.simdrive.tpdo import Tpdo
+
+Receive: TypeAlias = Callable[[bytes], None]
+"""Takes the data of the frames with one CAN-ID."""
+
+_ABORT_CONNECTION = (0x6007, 0)
+
+
+class SimulatedDrive:
+    """A CiA 402 servo drive in cyclic synchronous torque mode: frames in, frames out.
+
+    No threads and no clock: SYNC moves the physics, ``tick`` the protocol timers.
+    """
+
+    def __init__(
+        self, dictionary: Dictionary, node_id: int, motion: Motion, sync_period_s: float
+    ) -> None:
+        """Build the drive; it is dead until ``boot``.
+
+        Args:
+            dictionary: object dictionary, loaded for this node-ID; the drive takes it over.
+            node_id: 1 to 127.
+            motion: motor, encoder and hand.
+            sync_period_s: time in seconds by which each SYNC moves the physics.
+
+        Raises:
+            DictionaryError: the dictionary has what no drive can be built from.
+            ValueError: the node-ID is not that of the dictionary, or the period not positive.
+        """
+        if node_id != dictionary.node_id:
+            raise ValueError(f"node-ID {node_id}, but {dictionary.node_id} in the dictionary")
+        if not sync_period_s > 0:
+            raise ValueError(f"SYNC period {sync_period_s} s is not positive")
+        self._dictionary = dictionary
+        self._motion = motion
+        self._sync_period_s = sync_period_s
+        self._clock = Clock()
+        self._outbox: list[Frame] = []
+        send = self._outbox.append
+        self._emcy = EmergencyProducer(dictionary, send)
+        self._axis = Axis(dictionary, motion, self._emcy)
+        self._sync = SyncConsumer(dictionary, self._route)
+        self._sdo = SdoServer(dictionary, send)
+        self._heartbeat_producer = HeartbeatProducer(dictionary, self._clock, send)
+        self._heartbeat_consumer = HeartbeatConsumer(
+            dictionary, self._clock, self._route, self._heartbeat_lost, self._heartbeat_regained
+        )
+        self._rpdos = [
+            Rpdo(dictionary, index, self._clock, self._emcy, self._route, self._connection_lost)
+            for index in dictionary.indices(rpdo.COMMUNICATION)
+        ]
+        self._tpdos = [
+            Tpdo(dictionary, index, self._clock, send, self._route)
+            for index in dictionary.indices(tpdo.COMMUNICATION)
+        ]
+        self._nmt = NmtSlave(node_id, self._leaving, self._entered, self._reset)
+        self._route()
+
+    def boot(self) -> list[Frame]:
+        """Switch the device on: power-on values, boot-up message, PRE-OPERATIONAL."""
+        self._reset(communication_only=False)
+        return self._take_outbox()
+
+    def process(self, can_id: int, data: bytes) -> list[Frame]:
+        """Take a frame from the bus and return the frames that it makes the drive send.
+
+        Args:
+            can_id: 11-bit identifier.
+            data: 0 to 8 bytes.
+        """
+        receive = self._routes.get(can_id)
+        if receive is None:
+            return []
+        receive(data)
+        for transmitted in self._event_tpdos:
+            transmitted.poll()
+        return self._take_outbox()
+
+    def tick(self, dt: float) -> list[Frame]:
+        """Let the protocol timers go on by ``dt`` seconds; return the frames that are due."""
+        self._clock.advance(dt)
+        if self._nmt.state is not NmtState.INITIALISATION:
+            self._axis.state_machine.step()
+            self._heartbeat_producer.tick(self._nmt.state)
+            self._heartbeat_consumer.tick()
+            for received in self._rpdos:
+                received.tick()
+            for transmitted in self._event_tpdos:
+                transmitted.poll()
+        return self._take_outbox()
+
+    def _take_outbox(self) -> list[Frame]:
+        frames = self._outbox.copy()
+        self._outbox.clear()
+        return frames
+
+    def _route(self) -> None:
+        """Settle who takes what: every change of NMT state or of a COB-ID ends here."""
+        state = self._nmt.state
+        operational = state is NmtState.OPERATIONAL
+        rpdos = [pdo for pdo in self._rpdos if operational and pdo.active]
+        tpdos = [pdo for pdo in self._tpdos if operational and pdo.active]
+        self._sync_rpdos = [pdo for pdo in rpdos if pdo.synchronous]
+        self._sync_tpdos = [pdo for pdo in tpdos if pdo.synchronous]
+        self._event_tpdos = [pdo for pdo in tpdos if not pdo.synchronous]
+        routes: dict[int, Receive] = {}
+        if state is not NmtState.INITIALISATION:
+            routes |= _receivers(rpdos)
+            routes |= self._heartbeat_consumer.routes()
+            if state is not NmtState.STOPPED:
+                routes[self._sdo.can_id] = self._sdo.receive
+            # The world does not stand still where NMT wants no SYNC.
+            routes[self._sync.can_id] = self._on_sync
+            routes[nmt.CAN_ID] = self._nmt.receive
+        self._routes = routes
+
+    def _on_sync(self, _: bytes) -> None:
+        self._axis.state_machine.step()
+        for received in self._sync_rpdos:
+            received.sync()
+        torque_nm = self._axis.apply_torque()
+        self._axis.sample()
+        for transmitted in self._sync_tpdos:
+            transmitted.sync()
+        self._motion.advance(torque_nm, self._sync_period_s)
+
+    def _leaving(self) -> None:
+        if self._nmt.state is NmtState.OPERATIONAL:
+            self._axis.abort_connection(COMMUNICATION, _ABORT_CONNECTION)
+
+    def _entered(self) -> None:
+        self._emcy.silent = self._nmt.state is NmtState.STOPPED
+        for received in self._rpdos:
+            received.stop()
+        for transmitted in self._tpdos:
+            transmitted.start()
+        self._route()
+
+    def _reset(self, communication_only: bool) -> None:
+        self._axis.disable()
+        self._nmt.state = NmtState.INITIALISATION
+        self._dictionary.reset(communication_only=communication_only)
+        self._emcy.reset(communication_only=communication_only)
+        if not communication_only:
+            self._axis.reset()
+        self._sdo.reset()
+        self._heartbeat_consumer.reset()
+        for pdo in (*self._rpdos, *self._tpdos):
+            pdo.configure()
+        self._heartbeat_producer.reset()
+        self._heartbeat_producer.boot_up()
+        self._nmt.enter(NmtState.PRE_OPERATIONAL)
+
+    def _connection_lost(self, code: int, source: Key) -> None:
+        self._emcy.occurred(code, source)
+        self._axis.abort_connection(code, source)
+
+    def _heartbeat_lost(self, source: Key) -> None:
+        self._connection_lost(HEARTBEAT_LOST, source)
+
+    def _heartbeat_regained(self, source: Key) -> None:
+        self._emcy.gone(HEARTBEAT_LOST, source)
+
+
+def _receivers(rpdos: list[Rpdo]) -> dict[int, Receive]:
+    """Return who takes each CAN-ID; several RPDOs may listen to one."""
+    listeners: dict[int, list[Receive]] = {}
+    for pdo in rpdos:
+        listeners.setdefault(pdo.can_id, []).append(pdo.receive)
+    return {
+        can_id: receivers[0] if len(receivers) == 1 else partial(_call_each, receivers)
+        for can_id, receivers in listeners.items()
+    }
+
+
+def _call_each(receivers: list[Receive], data: bytes) -> None:
+    for receive in receivers:
+        receive(data)

@@ -1,0 +1,145 @@
+"""Heartbeat (CiA 301, 7.2.8.3.2): the producer of 0x1017 and the consumer of 0x1016."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import TypeAlias
+
+from canwall.simdrive.abort import AbortCode, AccessError
+from canwall.simdrive.dictionary import Dictionary, Entry, Key
+from canwall.simdrive.frame import NS_PER_MS, Clock, Send
+
+Report: TypeAlias = Callable[[Key], None]
+"""Told of an entry by its (index, sub-index)."""
+
+ERROR_CONTROL = 0x700
+_NMT_STATE = 0x7F
+_BOOT_UP = 0
+
+
+class HeartbeatProducer:
+    """Sends the NMT state every 0x1017 milliseconds, beginning one period after the write."""
+
+    def __init__(self, dictionary: Dictionary, clock: Clock, send: Send) -> None:
+        """Serve 0x1017 of the dictionary."""
+        self._can_id = ERROR_CONTROL + dictionary.node_id
+        self._clock = clock
+        self._send = send
+        self._time_ms = dictionary.number(0x1017, absent=0)
+        self._time_ms.react = lambda _: self.reset()
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new period now, with the time in 0x1017."""
+        self._period_ns = self._time_ms.value * NS_PER_MS
+        self._due_ns = self._clock.now_ns + self._period_ns
+
+    def boot_up(self) -> None:
+        """Send the boot-up message."""
+        self._send((self._can_id, bytes([_BOOT_UP])))
+
+    def tick(self, nmt_state: int) -> None:
+        """Send what is due; periods that were slept through are not made up for."""
+        now_ns = self._clock.now_ns
+        if self._period_ns and now_ns >= self._due_ns:
+            self._send((self._can_id, bytes([nmt_state])))
+            self._due_ns += self._period_ns
+            if self._due_ns <= now_ns:
+                self._due_ns = now_ns + self._period_ns
+
+
+class HeartbeatConsumer:
+    """Watches the nodes of 0x1016, each from its first heartbeat on.
+
+    A boot-up message is no heartbeat: a master that restarts goes missing like one that died.
+    """
+
+    def __init__(
+        self,
+        dictionary: Dictionary,
+        clock: Clock,
+        changed: Callable[[], None],
+        lost: Report,
+        regained: Report,
+    ) -> None:
+        """Serve 0x1016 of the dictionary.
+
+        Args:
+            dictionary: has the entries.
+            clock: protocol time.
+            changed: called when other nodes are to be watched.
+            lost: called with the (index, sub-index) of the entry whose time has run out.
+            regained: called with the entry whose node is back, or is not watched any more.
+        """
+        self._changed = changed
+        self._watches = [
+            _Watch(dictionary[0x1016, subindex], clock, lost, regained)
+            for subindex in range(1, 128)
+            if (0x1016, subindex) in dictionary
+        ]
+        for watch in self._watches:
+            watch.entry.check = partial(self._check, watch)
+            watch.entry.react = partial(self._react, watch)
+
+    def reset(self) -> None:
+        """Wait for the first heartbeat of every node again."""
+        for watch in self._watches:
+            watch.deadline_ns = None
+
+    def routes(self) -> dict[int, Callable[[bytes], None]]:
+        """Return who takes the frames of the nodes that are watched, by CAN-ID."""
+        return {
+            ERROR_CONTROL + _node_id(watch.entry.value): watch.receive
+            for watch in self._watches
+            if _is_used(watch.entry.value)
+        }
+
+    def tick(self) -> None:
+        """Report the nodes that have been silent for too long, once."""
+        for watch in self._watches:
+            watch.tick()
+
+    def _check(self, watch: "_Watch", value: int) -> None:
+        if value >> 24 or _node_id(value) > 127:
+            raise AccessError(AbortCode.INVALID_VALUE)
+        others = [other.entry.value for other in self._watches if other is not watch]
+        watched = [_node_id(other) for other in others if _is_used(other)]
+        if _is_used(value) and _node_id(value) in watched:
+            raise AccessError(AbortCode.INCOMPATIBLE_PARAMETER)
+
+    def _react(self, watch: "_Watch", _: int) -> None:
+        watch.stop()
+        self._changed()
+
+
+class _Watch:
+    """One node under watch: bits 16 to 23 of the entry are its ID, bits 0 to 15 the time in ms."""
+
+    def __init__(self, entry: Entry, clock: Clock, lost: Report, regained: Report) -> None:
+        self.entry = entry
+        self.deadline_ns: int | None = None
+        self._clock = clock
+        self._lost = lost
+        self._regained = regained
+
+    def receive(self, data: bytes) -> None:
+        if len(data) == 1 and data[0] & _NMT_STATE != _BOOT_UP:
+            time_ms = self.entry.value & 0xFFFF
+            self.deadline_ns = self._clock.now_ns + time_ms * NS_PER_MS
+            self._regained(self.entry.key)
+
+    def tick(self) -> None:
+        if self.deadline_ns is not None and self._clock.now_ns >= self.deadline_ns:
+            self.deadline_ns = None
+            self._lost(self.entry.key)
+
+    def stop(self) -> None:
+        self.deadline_ns = None
+        self._regained(self.entry.key)
+
+
+def _node_id(value: int) -> int:
+    return value >> 16 & 0xFF
+
+
+def _is_used(value: int) -> bool:
+    return bool(_node_id(value) and value & 0xFFFF)

@@ -1,0 +1,160 @@
+"""What receive and transmit PDOs share: communication and mapping parameter (CiA 301, 7.5.2.35-38).
+
+The order that CiA 301 prescribes is kept: COB-ID invalid (bit 31), number of mapped objects 0,
+mapping entries, number of mapped objects, COB-ID valid. Anything else gets DEVICE_STATE.
+"""
+
+from collections.abc import Callable
+from struct import Struct
+
+from canwall.simdrive.abort import AbortCode, AccessError
+from canwall.simdrive.cob_id import CAN_ID, NOT_VALID, check_can_id, check_unchanged_while_valid
+from canwall.simdrive.dictionary import Dictionary, Entry
+
+CYCLIC = range(1, 241)
+ACYCLIC = 0
+_EVENT_DRIVEN = (254, 255)
+_TRANSMISSION_TYPES = frozenset((ACYCLIC, *CYCLIC, *_EVENT_DRIVEN))
+"""241 to 251 are reserved; 252 and 253 wait for remote frames, which the drive ignores."""
+
+_MAX_BYTES = 8
+
+
+class Pdo:
+    """One PDO. While active, its mapping is compiled: a struct, and the entries that it holds."""
+
+    transmit: bool
+    """Direction, as the subclass has it."""
+
+    def __init__(
+        self,
+        dictionary: Dictionary,
+        communication: int,
+        mapping: int,
+        changed: Callable[[], None],
+    ) -> None:
+        """Serve one pair of objects.
+
+        Args:
+            dictionary: has the entries.
+            communication: index of the communication parameter.
+            mapping: index of the mapping parameter.
+            changed: called when the PDO became active or inactive, or moved.
+
+        Raises:
+            DictionaryError: the EDS lacks a part of the PDO, or maps what cannot be mapped.
+        """
+        for key in ((communication, 1), (communication, 2), (mapping, 0)):
+            if key not in dictionary:
+                raise dictionary.error(*key, "missing")
+        self._dictionary = dictionary
+        self._changed = changed
+        self._cob_id = dictionary.number(communication, 1, absent=NOT_VALID)
+        self._type = dictionary.number(communication, 2, absent=255)
+        self._type.allow(_TRANSMISSION_TYPES)
+        self._event_time = dictionary.number(communication, 5, absent=0)
+        self._count = dictionary.number(mapping, 0, absent=0)
+        self._mapping = [
+            dictionary.number(mapping, subindex, absent=0)
+            for subindex in range(1, 65)
+            if (mapping, subindex) in dictionary
+        ]
+        self._cob_id.check = self._check_cob_id
+        self._count.check = self._check_count
+        for entry in self._mapping:
+            entry.check = self._check_mapping
+        for entry in (self._cob_id, self._type, self._event_time):
+            entry.react = self._react
+        try:
+            self.configure()
+        except AccessError as abort:
+            raise dictionary.error(mapping, 0, f"maps what cannot be mapped: {abort}") from abort
+
+    @property
+    def can_id(self) -> int:
+        """CAN-ID of the PDO."""
+        can_id: int = self._cob_id.value & CAN_ID
+        return can_id
+
+    @property
+    def valid(self) -> bool:
+        """Whether bit 31 of the COB-ID is clear."""
+        return not self._cob_id.value & NOT_VALID
+
+    @property
+    def active(self) -> bool:
+        """Whether the PDO is valid and carries something."""
+        return self.valid and self._count.value > 0
+
+    @property
+    def synchronous(self) -> bool:
+        """Whether SYNC moves the PDO."""
+        return self._type.value not in _EVENT_DRIVEN
+
+    def configure(self) -> None:
+        """Compile the mapping of an active PDO; called whenever a parameter has changed.
+
+        Raises:
+            AccessError: the mapping is not possible. What is written was checked before, so only
+                the power-on values can be wrong.
+        """
+        formats, entries = self._compile(self._count.value if self.active else 0)
+        self._struct = Struct("<" + formats)
+        self._entries = entries
+
+    def _compile(self, count: int) -> tuple[str, list[Entry]]:
+        """Return the struct format and the entries of the first ``count`` mapped objects."""
+        if count > len(self._mapping):
+            raise AccessError(AbortCode.TOO_HIGH)
+        formats = ""
+        entries = []
+        for mapped in self._mapping[:count]:
+            form, entry = self._resolve(mapped.value)
+            formats += form
+            if entry is not None:
+                entries.append(entry)
+        if Struct("<" + formats).size > _MAX_BYTES:
+            raise AccessError(AbortCode.PDO_LENGTH)
+        return formats, entries
+
+    def _resolve(self, mapped: int) -> tuple[str, Entry | None]:
+        """Return format and entry of a mapping value (index, sub-index, bits); None: dummy."""
+        index, subindex, bits = mapped >> 16, mapped >> 8 & 0xFF, mapped & 0xFF
+        dummy_size = self._dictionary.dummies.get(index)
+        if dummy_size is not None and subindex == 0 and not self.transmit:
+            if bits != 8 * dummy_size:
+                raise AccessError(AbortCode.NOT_MAPPABLE)
+            return f"{dummy_size}x", None
+        entry = self._dictionary.find(index, subindex)
+        allowed = entry.transmittable if self.transmit else entry.receivable
+        form = entry.pdo_format
+        if not allowed or form is None or entry.size is None or bits != 8 * entry.size:
+            raise AccessError(AbortCode.NOT_MAPPABLE)
+        return form, entry
+
+    def _check_cob_id(self, value: int) -> None:
+        check_unchanged_while_valid(self._cob_id.value, value)
+        if not value & NOT_VALID:
+            check_can_id(value)
+            if not self._count.value:
+                raise AccessError(AbortCode.DEVICE_STATE)
+            self._compile(self._count.value)
+
+    def _check_count(self, value: int) -> None:
+        self._check_not_valid()
+        self._compile(value)
+
+    def _check_mapping(self, value: int) -> None:
+        self._check_not_valid()
+        if self._count.value:
+            raise AccessError(AbortCode.DEVICE_STATE)
+        if value:  # 0 empties a place
+            self._resolve(value)
+
+    def _check_not_valid(self) -> None:
+        if self.valid:
+            raise AccessError(AbortCode.DEVICE_STATE)
+
+    def _react(self, _: int) -> None:
+        self.configure()
+        self._changed()

@@ -1,0 +1,102 @@
+"""Transmit PDOs (CiA 301, 7.5.2.37 and 7.5.2.38)."""
+
+from collections.abc import Callable
+
+from canwall.simdrive.abort import AbortCode, AccessError
+from canwall.simdrive.cob_id import BIT_30, NOT_VALID
+from canwall.simdrive.dictionary import Dictionary
+from canwall.simdrive.frame import NS_PER_100_US, NS_PER_MS, Clock, Send
+from canwall.simdrive.pdo import CYCLIC, Pdo
+
+COMMUNICATION = range(0x1800, 0x1A00)
+_MAPPING_OFFSET = 0x200
+
+
+class Tpdo(Pdo):
+    """One transmit PDO: with every n-th SYNC (1 to 240), or when its content has changed.
+
+    An event is a change of what is mapped. It is sent with the next SYNC (type 0), or at once
+    (254, 255), no sooner than the inhibit time after the last; the event timer sends without one.
+    """
+
+    transmit = True
+
+    def __init__(
+        self,
+        dictionary: Dictionary,
+        index: int,
+        clock: Clock,
+        send: Send,
+        changed: Callable[[], None],
+    ) -> None:
+        """Serve the communication parameter ``index`` and its mapping.
+
+        Args:
+            dictionary: has the entries.
+            index: of the communication parameter.
+            clock: protocol time.
+            send: takes the frames.
+            changed: called when the PDO became active or inactive, or moved.
+
+        Raises:
+            DictionaryError: as Pdo.
+        """
+        self._clock = clock
+        self._send = send
+        self._inhibit_time = dictionary.number(index, 3, absent=0)
+        self._inhibit_time.check = self._check_inhibit_time
+        super().__init__(dictionary, index, index + _MAPPING_OFFSET, changed)
+
+    def configure(self) -> None:
+        """Compile the mapping and begin anew."""
+        super().configure()
+        self._inhibit_ns = self._inhibit_time.value * NS_PER_100_US
+        self._event_ns = self._event_time.value * NS_PER_MS
+        self._frame_id = self.can_id
+        # How many SYNCs make one transmission; None: an event does.
+        self._divider = self._type.value if self._type.value in CYCLIC else None
+        self.start()
+
+    def start(self) -> None:
+        """Begin anew, as on entering OPERATIONAL: the present content counts as an event."""
+        self._syncs = 0
+        self._sent: bytes | None = None
+        self._event_due_ns = 0
+        self._inhibited_until_ns = 0
+
+    def sync(self) -> None:
+        """Send what is due with this SYNC."""
+        if self._divider is None:
+            payload = self._payload()
+            if payload != self._sent:
+                self._transmit(payload)
+            return
+        self._syncs += 1
+        if self._syncs >= self._divider:
+            self._syncs = 0
+            self._send((self._frame_id, self._payload()))
+
+    def poll(self) -> None:
+        """Send an event-driven PDO if there is reason to and time has come."""
+        payload = self._payload()
+        now_ns = self._clock.now_ns
+        timer_due = self._event_ns and now_ns >= self._event_due_ns
+        if (payload != self._sent or timer_due) and now_ns >= self._inhibited_until_ns:
+            self._event_due_ns = now_ns + self._event_ns
+            self._inhibited_until_ns = now_ns + self._inhibit_ns
+            self._transmit(payload)
+
+    def _payload(self) -> bytes:
+        return self._struct.pack(*[entry.value for entry in self._entries])
+
+    def _transmit(self, payload: bytes) -> None:
+        self._sent = payload
+        self._send((self._frame_id, payload))
+
+    def _check_inhibit_time(self, _: int) -> None:
+        self._check_not_valid()
+
+    def _check_cob_id(self, value: int) -> None:
+        super()._check_cob_id(value)
+        if not value & (NOT_VALID | BIT_30):
+            raise AccessError(AbortCode.INVALID_VALUE)  # would promise answers to remote frames

@@ -1,0 +1,42 @@
+# Sourced by the scripts beside it: a virtual environment in the checkout, made when needed.
+# `set_up_environment EXTRA` sets $root and $bin; EXTRA is empty or "[dev]".
+
+root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
+bin=$root/.venv/bin
+
+set_up_environment() {
+  # What an environment holds is noted in it; it is made anew where the checkout was moved, and
+  # completed where pyproject.toml has changed or more is asked for than was installed.
+  state="$root $(cksum <"$root/pyproject.toml")"
+  for extra in "[dev]" "$1"; do
+    note=$root/.venv/installed$extra
+    if [ -f "$note" ] && [ "$(cat "$note")" = "$state" ]; then
+      return
+    fi
+  done
+  (
+    # Two first starts at once take turns.
+    if command -v flock >/dev/null; then
+      flock 9
+    fi
+    python=$(find_python)
+    echo "canwall: setting up $root/.venv (first start)" >&2
+    if ! [ -x "$bin/python" ] || ! "$bin/python" -c '' 2>/dev/null || ! grep -qsF "$root" "$root"/.venv/installed*; then
+      "$python" -m venv --clear "$root/.venv"
+    fi
+    "$bin/python" -m pip install --quiet --disable-pip-version-check --editable "$root$1" >&2
+    printf '%s' "$state" >"$root/.venv/installed$1"
+  ) 9>"$root/.venv.lock"
+}
+
+find_python() {
+  for candidate in python3 python3.14 python3.13 python3.12 python3.11; do
+    if command -v "$candidate" >/dev/null &&
+      "$candidate" -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then
+      echo "$candidate"
+      return
+    fi
+  done
+  echo "canwall: Python 3.11 or newer with venv is needed; install it (Debian: python3-venv)" >&2
+  exit 2
+}
