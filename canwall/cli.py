@@ -143,10 +143,13 @@ class _RunProgress:
 
 def _strike_table(strikes: list[dict[str, Any]]) -> Table:
     table = Table(title="Strikes", title_justify="left")
-    for heading in ("#", "law", "K [N·m/rad]", "contacts", "peak penetration [mrad]"):
-        table.add_column(heading, justify="left" if heading == "law" else "right")
-    table.add_column("energy out [mJ]", justify="right")
-    table.add_column("chatter")
+    table.add_column("#", justify="right")
+    table.add_column("law", no_wrap=True)
+    table.add_column("K\n[N·m/rad]", justify="right")
+    table.add_column("contacts", justify="right")
+    table.add_column("deepest\n[mrad]", justify="right")
+    table.add_column("energy out\n[mJ]", justify="right")
+    table.add_column("chatter", no_wrap=True)
     for number, strike in enumerate(strikes, start=1):
         chatter = "no"
         if strike["chatter"]:

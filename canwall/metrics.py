@@ -108,7 +108,11 @@ def chatter(y: Array, referent: Array | None, cycle_s: float, tolerance: float) 
     settled = settled_stretch(referent, tolerance)
     if (settled.stop - settled.start) * cycle_s < SETTLED_S:
         return Chatter(False, "the referent never settles; amplitude not judged")
-    measured, expected = float(np.ptp(y[settled])), float(np.ptp(referent[settled]))
+    # The wall may come to rest somewhat later than the referent, and leave its rest somewhat
+    # before it: what lasts is judged, over the middle of the stretch.
+    length = settled.stop - settled.start
+    rest = slice(settled.start + length // 2, settled.start + length * 9 // 10)
+    measured, expected = float(np.ptp(y[rest])), float(np.ptp(referent[rest]))
     compared = f"{measured:.3g} peak to peak about the settled contact, referent {expected:.3g}"
     return Chatter(
         measured - expected > tolerance, f"{compared}, quantisation explains {tolerance:.3g}"

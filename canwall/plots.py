@@ -107,6 +107,7 @@ def _torque(
         drawstyle="steps-post",
     )
     _mark_strikes(axes, strikes, colours)
+    axes.margins(x=0.01)
     axes.set_xlabel("time [s]")
     axes.set_ylabel("torque applied [N·m]")
 
@@ -128,7 +129,7 @@ def _close_up(
     axes.set_xlabel("time from contact [ms]")
     axes.set_ylabel("penetration, f/K [mrad]")
     axes.set_title(f"First contact: {strike['law']}")
-    axes.legend(loc="upper right")
+    axes.legend()
 
 
 def _force_over_position(

@@ -10,7 +10,7 @@ from canwall.compiled import data_to_number, number_to_data
 from canwall.cycle.step import step
 from canwall.cycle.timing import HISTOGRAM, observe_ns
 from canwall.drive import DriveSetup, Link
-from canwall.record import ROW, Ring
+from canwall.record import ROW, Phase, Ring
 from canwall.record.ring import put_row
 
 #: In simulated time nothing is late: this long a TPDO is waited for before it counts as lost.
@@ -60,6 +60,17 @@ class PythonCanExchange:
         self.late_rpdo = 0
         self._deadline_ns = 0
         self._last_sync_ns = 0
+        self._warm_up()
+
+    def _warm_up(self) -> None:
+        # What is compiled is loaded at its first call, which takes longer than many a cycle.
+        cycle, row = self._cycle.copy(), self.row.copy()
+        for phase in Phase:
+            cycle["phase"] = phase
+            step(cycle, row, 0, True)
+            step(cycle, row, 0, False)
+        put_row(self._ring.header.copy(), self._ring.rows[:1].copy(), row)
+        observe_ns(self.latency.copy(), 0)
 
     def cycle(self) -> None:
         """One cycle. Raises can.CanError where the bus fails."""

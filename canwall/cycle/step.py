@@ -133,11 +133,15 @@ def make_cycle(settings: Settings, setup: DriveSetup, law_names: list[str]) -> N
     cycle["ramp_cycles"] = limits.ramp_cycles
     for i, name in enumerate(law_names):
         cycle["laws"][0, i] = find_law(name).address
-    model = (mechanics.inertia_kg_m2, mechanics.viscous_nm_s_per_rad, 0.0, period)
-    set_plant(cycle["wall"][0], *model)
+    mass, viscous, spring = mechanics.inertia_kg_m2, mechanics.viscous_nm_s_per_rad, 0.0
+    set_plant(cycle["wall"][0], mass, viscous, spring, period)
     set_estimator(
         cycle["estimator"][0],
-        *model,
+        mass,
+        viscous,
+        spring,
+        mechanics.coulomb_nm,
+        period,
         count=units.rad_per_count,
         bandwidth_hz=settings.estimator.bandwidth_hz,
         delay=SYNCHRONOUS_DELAY,

@@ -18,7 +18,7 @@ from canwall.physics import zoh
 #: Largest delay, in whole periods, between a sample and the force computed from it.
 MAX_DELAY = 3
 
-_HOLD = [("phi", "f8", (2, 2)), ("gamma", "f8", (2,))]
+_HOLD = [("duration", "f8"), ("phi", "f8", (2, 2)), ("gamma", "f8", (2,))]
 
 #: Filter and model of one wall. `before` and `after` are the hold equivalents over the two parts
 #: of a period that an actuation δ·T after the sample cuts it into; `full` is the whole period.
@@ -28,6 +28,8 @@ ESTIMATOR = np.dtype(
         ("v", "f8"),
         ("d", "f8"),
         ("gain", "f8", (3,)),
+        ("mass", "f8"),
+        ("coulomb", "f8"),
         ("delay_periods", "i8"),
         ("full", _HOLD, (1,)),
         ("before", _HOLD, (1,)),
@@ -75,6 +77,7 @@ def set_estimator(
     mass: float,
     viscous: float,
     spring: float,
+    coulomb: float,
     period: float,
     count: float,
     bandwidth_hz: float,
@@ -89,9 +92,12 @@ def set_estimator(
     whole = math.floor(delay)
     fraction = delay - whole
     estimator["delay_periods"] = whole
+    estimator["mass"] = mass
+    estimator["coulomb"] = coulomb
     estimator["gain"] = kalman_gain(mass, viscous, spring, period, count, bandwidth_hz)
     for name, share in (("full", 1.0), ("before", fraction), ("after", 1.0 - fraction)):
         phi, gamma = zoh(mass, viscous, spring, share * period)
+        estimator[name]["duration"] = share * period
         estimator[name]["phi"] = phi
         estimator[name]["gamma"] = gamma
 
@@ -104,8 +110,15 @@ def reset_estimator(estimator: NDArray[np.void], y: float) -> None:
 
 
 @compiled
-def _hold(model: Record, y: float, v: float, force: float) -> tuple[float, float]:
+def _hold(
+    estimator: Record, model: Record, y: float, v: float, force: float
+) -> tuple[float, float]:
     phi, gamma = model.phi, model.gamma
+    if model.duration > 0.0:
+        # Coulomb friction opposes the motion, but no more than stops it: at rest it holds
+        # against whatever pulls, and that is for d̂ to find out.
+        stopping = estimator.mass * v / model.duration
+        force -= min(max(stopping, -estimator.coulomb), estimator.coulomb)
     return (
         phi[0, 0] * y + phi[0, 1] * v + gamma[0] * force,
         phi[1, 0] * y + phi[1, 1] * v + gamma[1] * force,
@@ -125,11 +138,10 @@ def observe(estimator: Record, y_sample: float) -> None:
 def actuation_state(estimator: Record) -> tuple[float, float]:
     """State (ŷ, ẏ̂) at the instant at which the force computed now takes effect."""
     n = estimator.delay_periods
-    y, v = _hold(
-        estimator.before[0], estimator.y, estimator.v, estimator.committed[n] + estimator.d
+    y, v = _hold(estimator, estimator.before[0], estimator.y, estimator.v, estimator.committed[n] + estimator.d
     )
     for age in range(n - 1, -1, -1):
-        y, v = _hold(estimator.full[0], y, v, estimator.committed[age] + estimator.d)
+        y, v = _hold(estimator, estimator.full[0], y, v, estimator.committed[age] + estimator.d)
     return y, v
 
 
@@ -141,8 +153,8 @@ def commit(estimator: Record, force: float) -> None:
     """
     n = estimator.delay_periods
     committed = estimator.committed
-    y, v = _hold(estimator.before[0], estimator.y, estimator.v, committed[n] + estimator.d)
+    y, v = _hold(estimator, estimator.before[0], estimator.y, estimator.v, committed[n] + estimator.d)
     for age in range(MAX_DELAY, 0, -1):
         committed[age] = committed[age - 1]
     committed[0] = force
-    estimator.y, estimator.v = _hold(estimator.after[0], y, v, committed[n] + estimator.d)
+    estimator.y, estimator.v = _hold(estimator, estimator.after[0], y, v, committed[n] + estimator.d)
