@@ -123,6 +123,7 @@ class _RunProgress:
             TextColumn("{task.fields[clock]}"),
             TimeRemainingColumn(),
             console=_errors,
+            disable=not _errors.is_terminal,
         )
         self._task = self._progress.add_task("preparing", total=None, clock="")
 
@@ -130,7 +131,9 @@ class _RunProgress:
         self._progress.start()
         return self
 
-    def __exit__(self, *exc_info: object) -> None:
+    def __exit__(self, error: type[BaseException] | None, *exc_info: object) -> None:
+        # The line that an error becomes stands alone.
+        self._progress.live.transient = error is not None
         self._progress.stop()
 
     def report(self, what: str) -> None:
@@ -145,10 +148,10 @@ def _strike_table(strikes: list[dict[str, Any]]) -> Table:
     table = Table(title="Strikes", title_justify="left")
     table.add_column("#", justify="right")
     table.add_column("law", no_wrap=True)
-    table.add_column("K\n[N·m/rad]", justify="right")
+    table.add_column("K\n\\[N·m/rad]", justify="right")
     table.add_column("contacts", justify="right")
-    table.add_column("deepest\n[mrad]", justify="right")
-    table.add_column("energy out\n[mJ]", justify="right")
+    table.add_column("deepest\n\\[mrad]", justify="right")
+    table.add_column("energy out\n\\[mJ]", justify="right")
     table.add_column("chatter", no_wrap=True)
     for number, strike in enumerate(strikes, start=1):
         chatter = "no"
@@ -182,7 +185,8 @@ def _guarded(command: Callable[[], object]) -> int:
     except (KeyboardInterrupt, typer.Abort):
         return INTERRUPTED
     except typer.TyperException as error:
-        _error(error.format_message())
+        if text := error.format_message():  # none where the help was shown instead
+            _error(text)
         return BAD_INPUT
     except InputError as error:
         _error(str(error))

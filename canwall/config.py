@@ -87,7 +87,11 @@ class Wall(_Section):
     side: Literal["below", "above"] = "below"
     stiffness_nm_per_rad: NonNegative = 50.0
     damping_nm_s_per_rad: NonNegative = 0.0
-    tension: Literal["allow", "clamp"] = "allow"
+    deadbeat: bool = False
+    velocity: Literal["difference", "estimated"] = "difference"
+    options: dict[str, Number] = Field(default_factory=dict)
+    tension: Literal["allow", "clamp", "budget"] = "allow"
+    passivity_nm_s_per_rad: NonNegative = 0.0
 
 
 class Estimator(_Section):
@@ -168,7 +172,11 @@ class Change(_Section):
     position_rad: Number | None = None
     stiffness_nm_per_rad: NonNegative | None = None
     damping_nm_s_per_rad: NonNegative | None = None
-    tension: Literal["allow", "clamp"] | None = None
+    deadbeat: bool | None = None
+    velocity: Literal["difference", "estimated"] | None = None
+    options: dict[str, Number] | None = None
+    tension: Literal["allow", "clamp", "budget"] | None = None
+    passivity_nm_s_per_rad: NonNegative | None = None
 
 
 class Settings(_Section):
@@ -280,11 +288,23 @@ def load(path: Path, overrides: Mapping[str, Any] | None = None) -> Settings:
         raise ConfigError(f"{path}: {_first_error(error, raw)}") from None
     except (TypeError, AttributeError):
         raise ConfigError(f"{path}: a section is not a table; see config/sim.toml") from None
-    eds = settings.drive.eds
-    if not eds.is_absolute():
-        drive = settings.drive.model_copy(update={"eds": (path.parent / eds).resolve()})
-        settings = settings.model_copy(update={"drive": drive})
-    return settings
+    return _with_absolute_paths(settings, path.parent)
+
+
+def _with_absolute_paths(settings: Settings, base: Path) -> Settings:
+    """The files that a configuration names, independent of where it lies."""
+    drive = settings.drive.model_copy(update={"eds": (base / settings.drive.eds).resolve()})
+    wall = settings.wall.model_copy(update={"law": _absolute_law(settings.wall.law, base)})
+    schedule = tuple(
+        change.model_copy(update={"law": change.law and _absolute_law(change.law, base)})
+        for change in settings.schedule
+    )
+    return settings.model_copy(update={"drive": drive, "wall": wall, "schedule": schedule})
+
+
+def _absolute_law(law: str, base: Path) -> str:
+    path, colon, function = law.rpartition(":")
+    return f"{(base / path).resolve()}:{function}" if colon else law
 
 
 def _first_error(error: ValidationError, raw: Mapping[str, Any]) -> str:

@@ -13,18 +13,28 @@ from typing import Any
 
 import can
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from canwall import simdrive
 from canwall.config import ConfigError, Settings
-from canwall.cycle import Change, Outcome, PythonCanExchange, make_cycle, run_loop, timing_summary
+from canwall.cycle import (
+    MAX_LAWS,
+    Change,
+    Outcome,
+    PythonCanExchange,
+    make_cycle,
+    run_loop,
+    timing_summary,
+)
 from canwall.drive import REQUIRED_OBJECTS, DriveNode, DriveSetup, Link, set_up
 from canwall.eds import load_eds
+from canwall.errors import RunFailedError
 from canwall.physics import advance, make_plant
 from canwall.plots import plot_run
-from canwall.record import Recorder, RunFolder, read_signals
+from canwall.record import Recorder, RecordError, RunFolder, read_signals
 from canwall.summary import summarise
-from canwall.walls import UnknownLawError, find_law
+from canwall.walls import Law, UnknownLawError, find_law
 
 Array = NDArray[np.float64]
 
@@ -71,11 +81,14 @@ def open_bus(settings: Settings) -> can.BusABC:
 def make_simulated_drive(settings: Settings) -> simdrive.SimulatedDrive:
     """The drive of `[simulation]`, from the dictionary of `[drive]`.
 
-    Raises ConfigError and DictionaryError.
+    Raises ConfigError.
     """
     if settings.simulation is None:
         raise ConfigError("[simulation] is missing: there is no drive to simulate")
-    return simdrive.make_drive(settings.drive, settings.simulation, settings.bus.cycle_s)
+    try:
+        return simdrive.make_drive(settings.drive, settings.simulation, settings.bus.cycle_s)
+    except simdrive.DictionaryError as error:
+        raise ConfigError(f"drive.eds: {error}") from None
 
 
 def serve_drive(settings: Settings, stop: Callable[[], bool]) -> None:
@@ -105,21 +118,23 @@ def run(
 
     report is told the steps before and after the loop, progress the seconds of bus time done and
     their end. Raises ConfigError and DictionaryError before anything is enabled, DriveError where
-    the drive cannot be set up.
+    the drive cannot be set up, RunFailedError where no cycle came about or none was recorded.
     """
-    law_names = _laws(settings)
+    laws = run_laws(settings)
     dictionary = load_eds(settings.drive.eds, settings.drive.node_id, REQUIRED_OBJECTS)
     simulated = make_simulated_drive(settings) if settings.embedded else None
-    folder = RunFolder.create(output)
-    folder.config.write_text(settings.to_toml(), encoding="utf-8")
     with _on_the_bus(settings, simulated) as link:
-        recorder = Recorder(folder.path, settings.run.bus_log, settings.bus.channel, law_names)
+        folder = RunFolder.create(output)
+        folder.config.write_text(settings.to_toml(), encoding="utf-8")
+        recorder = Recorder(
+            folder.path, settings.run.bus_log, settings.bus.channel, [law.name for law in laws]
+        )
         try:
             link.log = recorder.ring.log_frame
             report("setting up the drive")
             node = DriveNode(link, settings.drive.node_id, dictionary)
             setup = set_up(node, settings.drive)
-            cycle = make_cycle(settings, setup, law_names)
+            cycle = make_cycle(settings, setup, laws)
             exchange = PythonCanExchange(link, setup, cycle, recorder.ring, settings.real_time)
             end_s = settings.run.duration_s
             report("rendering")
@@ -128,7 +143,7 @@ def run(
                     exchange,
                     cycle,
                     node,
-                    law_names,
+                    laws,
                     _changes(settings),
                     None if end_s is None else round(end_s / settings.bus.cycle_s),
                     stop,
@@ -137,7 +152,7 @@ def run(
         finally:
             notes = recorder.close()
     report("summarising")
-    signals = read_signals(folder.signals)
+    signals = _recorded(folder, [*outcome.trips, *notes])
     summary = summarise(signals, settings, setup.units, referent_positions(settings, signals))
     summary |= {
         "missed_tpdo": int(cycle["missed_tpdo"][0]),
@@ -156,15 +171,33 @@ def run(
     return RunResult(folder, summary, outcome, notes)
 
 
-def _laws(settings: Settings) -> list[str]:
-    """The laws of the run, each once, in the order in which they are first used."""
-    names = list(dict.fromkeys(wall.law for _, wall in settings.walls))
-    for name in names:
+def _recorded(folder: RunFolder, troubles: list[str]) -> pa.Table:
+    """The signals of the run; without any, its troubles are all that is left to say."""
+    try:
+        signals = read_signals(folder.signals)
+    except ConfigError as error:
+        raise RecordError("; ".join(troubles) or str(error)) from None
+    if signals.num_rows == 0:
+        raise RunFailedError("; ".join(troubles))
+    return signals
+
+
+def run_laws(settings: Settings) -> list[Law]:
+    """The laws of the run, each once, in the order in which they are first used.
+
+    Raises ConfigError for a law that is not there or has not the options that it is given.
+    """
+    laws: dict[str, Law] = {}
+    for _, wall in settings.walls:
         try:
-            find_law(name)
+            law = find_law(wall.law, wall.deadbeat)
+            law.option_values(wall.options)
         except UnknownLawError as error:
             raise ConfigError(f"wall.law: {error}") from None
-    return names
+        laws[law.name] = law
+    if len(laws) > MAX_LAWS:
+        raise ConfigError(f"schedule: {len(laws)} laws; a run may change among {MAX_LAWS}")
+    return list(laws.values())
 
 
 def _changes(settings: Settings) -> list[Change]:
@@ -218,7 +251,7 @@ def referent_positions(settings: Settings, signals: Any) -> Array | None:
         plant["wall_stiffness"], plant["wall_damping"] = stiffness[j], damping[j]
         # The hand's spring is measured from the wall as well.
         pull = constant[j] - simulation.hand.stiffness_nm_per_rad * origin
-        y, v = advance(plant[0], y, v, pull, slope[j], period)
+        y, v, _ = advance(plant[0], y, v, pull, slope[j], period)
         if j + 1 < count:
             y += origin - side * wall_position[j + 1]
     return positions

@@ -2,12 +2,13 @@
 
 from canwall.cycle.exchange import PythonCanExchange
 from canwall.cycle.loop import Change, Outcome, run_loop
-from canwall.cycle.step import CYCLE, Trip, make_cycle, set_wall, step
+from canwall.cycle.step import CYCLE, MAX_LAWS, Trip, make_cycle, set_wall, step
 from canwall.cycle.timing import HISTOGRAM, observe_ns, percentile_ns, timing_summary
 
 __all__ = [
     "CYCLE",
     "HISTOGRAM",
+    "MAX_LAWS",
     "Change",
     "Outcome",
     "PythonCanExchange",

@@ -21,6 +21,8 @@ _MISSING_TIMEOUT_S = 0.05
 _SYNCHRONOUS_WINDOW = 0.8
 #: How full the ring of the record may be before simulated time waits for its writer.
 _BACKLOG = 0.5
+#: A writer that takes nothing for this long is taken for gone; what is lost is counted.
+_WRITER_PATIENCE_S = 10.0
 
 
 class PythonCanExchange:
@@ -60,6 +62,7 @@ class PythonCanExchange:
         self.late_rpdo = 0
         self._deadline_ns = 0
         self._last_sync_ns = 0
+        self._writer_reads = True
         self._warm_up()
 
     def _warm_up(self) -> None:
@@ -75,6 +78,8 @@ class PythonCanExchange:
     def cycle(self) -> None:
         """One cycle. Raises can.CanError where the bus fails."""
         sync_ns = self._wait_for_sync()
+        if self._cycle["missed_in_a_row"][0]:
+            self._drop_late()
         self._link.send(self._sync)
         message = self._receive()
         received_ns = time.perf_counter_ns()
@@ -83,6 +88,12 @@ class PythonCanExchange:
         self._rpdo.data[:] = number_to_data(answer, self._rpdo_length)
         self._link.send(self._rpdo)
         self._note(sync_ns, received_ns, time.perf_counter_ns())
+
+    def _drop_late(self) -> None:
+        # The TPDO that was missed may have come since. Taken for the next one, it would leave
+        # every position after it a cycle old.
+        while self._link.serve(0.0):
+            pass
 
     def _receive(self) -> can.Message | None:
         missing = bool(self._cycle["missed_in_a_row"][0])
@@ -103,10 +114,15 @@ class PythonCanExchange:
             # Deadlines are a grid: a late cycle is not made up for by a burst of SYNCs.
             behind = max(0, time.perf_counter_ns() - self._deadline_ns) // self._period_ns
             self._deadline_ns += (behind + 1) * self._period_ns
-        else:
-            while self._ring.backlog() > _BACKLOG:
-                time.sleep(0.001)
+        elif self._ring.backlog() > _BACKLOG:
+            self._wait_for_writer()
         return time.perf_counter_ns()
+
+    def _wait_for_writer(self) -> None:
+        deadline = time.monotonic() + _WRITER_PATIENCE_S
+        while self._writer_reads and self._ring.backlog() > _BACKLOG:
+            time.sleep(0.001)
+            self._writer_reads = time.monotonic() < deadline
 
     def _note(self, sync_ns: int, received_ns: int, sent_ns: int) -> None:
         row = self.row[0]

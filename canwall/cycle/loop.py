@@ -26,12 +26,15 @@ from canwall.drive import (
 )
 from canwall.drive import objects as od
 from canwall.record import Phase
+from canwall.walls import Law
 
 #: Cycles within which a drive has to reach OPERATION ENABLED, and to leave it.
 _ENABLE_CYCLES = 2000
 _LEAVE_CYCLES = 500
 #: Cycles without a TPDO after which a drive is taken for gone while leaving.
 _SILENT_CYCLES = 50
+#: States in which a drive gives no torque until it is enabled anew.
+_DISABLED = (State.SWITCH_ON_DISABLED, State.FAULT)
 #: Cycles before enabling in which position and statusword have to arrive.
 _FIRST_CYCLES = 10
 
@@ -62,7 +65,7 @@ def run_loop(
     exchange: PythonCanExchange,
     cycle: NDArray[np.void],
     node: DriveNode,
-    law_names: list[str],
+    laws: Sequence[Law],
     changes: Sequence[Change],
     cycles: int | None,
     stop: Callable[[], bool],
@@ -74,7 +77,7 @@ def run_loop(
     once a cycle; progress is told the cycle about every 100 ms of bus time.
     """
     outcome = Outcome()
-    loop = _Loop(exchange, cycle, node, law_names, list(changes), stop, progress)
+    loop = _Loop(exchange, cycle, node, laws, list(changes), stop, progress)
     # A collection would stop the cycle for milliseconds; nothing in it makes reference cycles.
     gc.collect()
     gc.freeze()
@@ -88,15 +91,27 @@ def run_loop(
         outcome.trips.append(f"the bus failed: {error}")
     finally:
         try:
-            outcome.disabled = loop.leave()
-        except (can.CanError, DriveError) as error:
-            outcome.trips.append(f"the drive could not be disabled over the bus: {error}")
-        gc.enable()
-        gc.unfreeze()
-        outcome.cycles = loop.j
+            _leave(loop, outcome)
+        finally:
+            gc.enable()
+            gc.unfreeze()
+            outcome.cycles = loop.j
     if not outcome.disabled and not outcome.trips:
         outcome.trips.append("the drive did not confirm that it is disabled")
     return outcome
+
+
+def _leave(loop: "_Loop", outcome: Outcome) -> None:
+    try:
+        outcome.disabled = loop.leave()
+        return
+    except can.CanError as error:
+        outcome.trips.append(f"the bus failed while leaving: {error}")
+    # The cycle is gone; SDO may still get through.
+    try:
+        outcome.disabled = loop.disable_over_sdo()
+    except DriveError as error:
+        outcome.trips.append(f"the drive could not be disabled: {error}")
 
 
 class _Loop:
@@ -105,7 +120,7 @@ class _Loop:
         exchange: PythonCanExchange,
         cycle: NDArray[np.void],
         node: DriveNode,
-        law_names: list[str],
+        laws: Sequence[Law],
         changes: list[Change],
         stop: Callable[[], bool],
         progress: Callable[[int], None],
@@ -114,7 +129,7 @@ class _Loop:
         self._cycle = cycle
         self._record = cycle[0]
         self._node = node
-        self._law_names = law_names
+        self._laws = laws
         self._changes = changes
         self._stop = stop
         self._progress = progress
@@ -162,7 +177,7 @@ class _Loop:
             if self._stop():
                 return True
             while pending and pending[0].j <= self.j:
-                set_wall(self._cycle, pending.pop(0).wall, self._law_names)
+                set_wall(self._cycle, pending.pop(0).wall, self._laws)
             exchange.cycle()
             if record["trip"]:
                 raise _WallGivenUpError(self._trip_text())
@@ -174,26 +189,25 @@ class _Loop:
         """Zero torque and the state machine down; whether the drive confirmed it."""
         record = self._record
         record["phase"] = Phase.LEAVING
-        try:
-            if record["trip"] == Trip.MISSED_TPDO:
-                # The drive may hear though it is not heard: quick stop, whatever its state.
-                record["controlword"] = Controlword.QUICK_STOP
-                self._exchange.cycle()
-            for _ in range(_LEAVE_CYCLES):
-                state = state_of(int(record["statusword"]))
-                record["controlword"] = controlword_down(state)
-                down = state in (State.SWITCH_ON_DISABLED, State.FAULT)
-                if down and self._exchange.row["phase"][0] == Phase.LEAVING:
-                    return True
-                if record["missed_in_a_row"] > _SILENT_CYCLES:
-                    return False
-                self._exchange.cycle()
-        except can.CanError:
-            # The cycle is gone; SDO may still get through.
-            self._node.write(od.TARGET_TORQUE, 0, 0)
-            self._node.write(od.CONTROLWORD, 0, Controlword.DISABLE_VOLTAGE)
-            raise
+        if record["trip"] == Trip.MISSED_TPDO:
+            # The drive may hear though it is not heard: quick stop, whatever its state.
+            record["controlword"] = Controlword.QUICK_STOP
+            self._exchange.cycle()
+        for _ in range(_LEAVE_CYCLES):
+            state = state_of(int(record["statusword"]))
+            record["controlword"] = controlword_down(state)
+            if state in _DISABLED and self._exchange.row["phase"][0] == Phase.LEAVING:
+                return True
+            if record["missed_in_a_row"] > _SILENT_CYCLES:
+                return False
+            self._exchange.cycle()
         return False
+
+    def disable_over_sdo(self) -> bool:
+        """Zero torque and no voltage without the cycle; whether the drive confirmed it."""
+        self._node.write(od.TARGET_TORQUE, 0, 0)
+        self._node.write(od.CONTROLWORD, 0, Controlword.DISABLE_VOLTAGE)
+        return state_of(self._node.read(od.STATUSWORD)) in _DISABLED
 
     def _state(self) -> str:
         statusword = int(self._record["statusword"])
@@ -219,6 +233,6 @@ class _Loop:
             case Trip.NOT_ENABLED:
                 what = f"the drive left OPERATION ENABLED: {self._state()}{self._emergency()}"
             case _:
-                law = self._law_names[int(record["law"])]
+                law = self._laws[int(record["law"])].name
                 what = f"law {law} gave a force that is not a number"
         return f"cycle {j} ({j * float(record['period']):.3f} s): {what}"

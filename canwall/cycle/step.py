@@ -4,28 +4,34 @@ Counts → y → estimator → state at the instant of actuation → law → ten
 """
 
 import math
+from collections.abc import Sequence
 from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
-from canwall.config import Settings, Wall
+from canwall.config import ConfigError, Settings, Wall
 from canwall.drive import DriveSetup, PdoLayout, State
 from canwall.drive import objects as od
 from canwall.record import Phase
 from canwall.units import to_per_mille
 from canwall.walls import (
     ESTIMATOR,
+    TENSION,
     WALL,
+    Law,
     actuation_state,
-    call_law,
     commit,
     find_law,
+    forget,
+    note_force,
     observe,
     reset_estimator,
     set_estimator,
     set_plant,
+    set_referent,
+    wall_force,
 )
 
 #: Laws among which a run can change.
@@ -45,9 +51,6 @@ class Trip(IntEnum):
     NOT_ENABLED = 4
     NOT_A_NUMBER = 5
 
-
-_TENSION = {"allow": 0, "clamp": 1}
-_CLAMP = 1
 
 # The enums' values as plain numbers for the compiled code.
 _RENDERING = int(Phase.RENDERING)
@@ -82,7 +85,7 @@ CYCLE = np.dtype(
         # The wall.
         ("orientation", "f8"),
         ("wall_position", "f8"),
-        ("tension", "i8"),
+        ("estimated_velocity", "?"),
         ("law", "i8"),
         ("laws", "u8", (MAX_LAWS,)),
         ("wall", WALL, (1,)),
@@ -106,11 +109,12 @@ CYCLE = np.dtype(
 )
 
 
-def make_cycle(settings: Settings, setup: DriveSetup, law_names: list[str]) -> NDArray[np.void]:
+def make_cycle(settings: Settings, setup: DriveSetup, laws: Sequence[Law]) -> NDArray[np.void]:
     """The record of one wall, ready for its first cycle; shape (1,), dtype CYCLE.
 
-    law_names are the laws of the run; a row's `law` is an index into them. Raises
-    UnknownLawError, and ValueError where model and estimator do not go together.
+    `laws` are the laws of the run; a row's `law` is an index into them. Raises UnknownLawError
+    for options that a law does not have, and ConfigError where estimator and cycle do not go
+    together.
     """
     cycle = np.zeros(1, CYCLE)
     for name, layout, index in (
@@ -131,22 +135,25 @@ def make_cycle(settings: Settings, setup: DriveSetup, law_names: list[str]) -> N
     cycle["position_low"], cycle["position_high"] = limits.position_rad
     cycle["hold_cycles"] = limits.hold_cycles
     cycle["ramp_cycles"] = limits.ramp_cycles
-    for i, name in enumerate(law_names):
-        cycle["laws"][0, i] = find_law(name).address
+    for i, law in enumerate(laws):
+        cycle["laws"][0, i] = law.address
     mass, viscous, spring = mechanics.inertia_kg_m2, mechanics.viscous_nm_s_per_rad, 0.0
     set_plant(cycle["wall"][0], mass, viscous, spring, period)
-    set_estimator(
-        cycle["estimator"][0],
-        mass,
-        viscous,
-        spring,
-        mechanics.coulomb_nm,
-        period,
-        count=units.rad_per_count,
-        bandwidth_hz=settings.estimator.bandwidth_hz,
-        delay=SYNCHRONOUS_DELAY,
-    )
-    set_wall(cycle, settings.wall, law_names)
+    try:
+        set_estimator(
+            cycle["estimator"][0],
+            mass,
+            viscous,
+            spring,
+            mechanics.coulomb_nm,
+            period,
+            count=units.rad_per_count,
+            bandwidth_hz=settings.estimator.bandwidth_hz,
+            delay=SYNCHRONOUS_DELAY,
+        )
+    except ValueError as error:
+        raise ConfigError(f"estimator.bandwidth_hz: {error}") from None
+    set_wall(cycle, settings.wall, laws)
     return cycle
 
 
@@ -156,17 +163,25 @@ def _set_field(cycle: NDArray[np.void], name: str, layout: PdoLayout, index: int
         cycle[name]["shift"], cycle[name]["bits"] = field.shift, field.bits
 
 
-def set_wall(cycle: NDArray[np.void], wall: Wall, law_names: list[str]) -> None:
-    """Change the wall between two cycles."""
+def set_wall(cycle: NDArray[np.void], wall: Wall, laws: Sequence[Law]) -> None:
+    """Change the wall between two cycles; its law is one of `laws`. Raises UnknownLawError."""
     cycle["orientation"] = 1.0 if wall.side == "below" else -1.0
     cycle["wall_position"] = wall.position_rad
-    cycle["tension"] = _TENSION[wall.tension]
-    cycle["wall"]["stiffness"] = wall.stiffness_nm_per_rad
-    cycle["wall"]["damping"] = wall.damping_nm_s_per_rad
-    law = law_names.index(wall.law)
-    if law != cycle["law"][0]:
-        cycle["law"] = law
-        cycle["wall"]["memory"] = 0.0
+    cycle["estimated_velocity"] = wall.velocity == "estimated"
+    law = find_law(wall.law, wall.deadbeat)
+    rendered = cycle["wall"][0]
+    set_referent(
+        rendered,
+        wall.stiffness_nm_per_rad,
+        wall.damping_nm_s_per_rad,
+        law.option_values(wall.options),
+    )
+    rendered["tension"] = TENSION[wall.tension]
+    rendered["passivity_damping"] = wall.passivity_nm_s_per_rad
+    index = [known.name for known in laws].index(law.name)
+    if index != cycle["law"][0]:
+        cycle["law"] = index
+        forget(rendered)
 
 
 def start_at(cycle: NDArray[np.void], counts: int) -> None:
@@ -226,11 +241,11 @@ def _wanted_force(cycle: Record, received: bool) -> float:
         cycle.trip = _NOT_ENABLED
     if cycle.trip:
         return 0.0
-    force = call_law(cycle.laws[cycle.law], cycle.wall[0])
+    force = wall_force(cycle.laws[cycle.law], cycle.wall[0])
     if not math.isfinite(force):
         cycle.trip = _NAN
         return 0.0
-    return max(force, 0.0) if cycle.tension == _CLAMP else force
+    return force
 
 
 @compiled
@@ -260,6 +275,8 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
         observe(estimator, oriented)
     wall.y_sample = oriented - origin
     wall.v_sample = (oriented - cycle.y_before) / cycle.period
+    if cycle.estimated_velocity:
+        wall.v_sample = estimator.v
     cycle.y_before = oriented
     y, wall.v = actuation_state(estimator)
     wall.y = y - origin
@@ -272,6 +289,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     per_mille = to_per_mille(cycle.orientation * force, cycle.nm_per_mille, cycle.torque_limit)
     torque = per_mille * cycle.nm_per_mille
     commit(estimator, cycle.orientation * torque)
+    note_force(wall, cycle.orientation * torque)
     cycle.torque_per_mille = per_mille
 
     row.j = cycle.j

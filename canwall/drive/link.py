@@ -5,6 +5,7 @@ Here whoever waits for a frame reads the bus, and hands what is not his to the n
 transfers and the cycle need no lock and no second thread.
 """
 
+import logging
 import time
 from collections.abc import Callable
 
@@ -12,6 +13,13 @@ import can
 import canopen
 from canopen.sdo import SdoClient
 from canopen.sdo.exceptions import SdoCommunicationError
+
+# What fails is raised; canopen logs it as well, which without a handler goes to stderr.
+logging.getLogger("canopen").addHandler(logging.NullHandler())
+
+#: Server command specifiers of an SDO's first answer, to a download and to an upload: it repeats
+#: index and subindex of the request (CiA 301, 7.2.4.3).
+_INITIATE_RESPONSES = (2, 3)
 
 #: Takes note of a frame: time [s], message, whether it was received (else sent).
 FrameLog = Callable[[float, can.Message, bool], None]
@@ -130,6 +138,16 @@ class _Sdo(SdoClient):  # type: ignore[misc]
     def __init__(self, rx: int, tx: int, dictionary: canopen.ObjectDictionary, link: Link) -> None:
         super().__init__(rx, tx, dictionary)
         self._link = link
+        self._requested = b""
+
+    def send_request(self, request: bytearray) -> None:
+        self._requested = bytes(request[1:4])
+        super().send_request(request)
+
+    def on_response(self, can_id: int, data: bytearray, timestamp: float) -> None:
+        # What comes too late for the request before, or for another master, answers nothing.
+        if data[0] >> 5 not in _INITIATE_RESPONSES or data[1:4] == self._requested:
+            super().on_response(can_id, data, timestamp)
 
     def read_response(self) -> bytes:
         deadline = time.monotonic() + self.RESPONSE_TIMEOUT

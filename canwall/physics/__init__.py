@@ -4,7 +4,7 @@ Everything is compiled and free of allocation on the hot path. Nothing here know
 control laws, of drives or of CAN.
 """
 
-from canwall.physics.motion import MAX_EVENTS, PLANT, advance, make_plant
+from canwall.physics.motion import MAX_EVENTS, PLANT, advance, contact_end, make_plant, time_to_wall
 from canwall.physics.oscillator import acceleration, basis, flow, zoh, zoh_coefficients
 
 __all__ = [
@@ -13,8 +13,10 @@ __all__ = [
     "acceleration",
     "advance",
     "basis",
+    "contact_end",
     "flow",
     "make_plant",
+    "time_to_wall",
     "zoh",
     "zoh_coefficients",
 ]

@@ -33,8 +33,8 @@ PLANT = np.dtype(
 )
 PLANT_TYPE = from_dtype(PLANT)
 
-#: Events within one call of `advance` beyond which the motion is taken for lost and returned as
-#: NaN rather than followed for ever. A period of a servo loop has a handful.
+#: Events within one call beyond which the motion is taken for lost and returned as NaN rather
+#: than followed for ever. A period of a servo loop has a handful.
 MAX_EVENTS = 1_000_000
 
 _POSITION, _VELOCITY, _ACCELERATION = 0, 1, 2
@@ -126,78 +126,137 @@ def _reversal(
     """
     _, v_end, a_end, _ = _derivatives(mass, viscous, spring, y, v, u0, u1, span)
     a_start = acceleration(mass, viscous, spring, y, v, u0)
-    peak = span
+    peak = 0.0
     if a_start * a_end < 0.0:
         peak = _root(_ACCELERATION, mass, viscous, spring, y, v, u0, u1, 0.0, span, a_end > 0.0)
         _, v_peak, _, _ = _derivatives(mass, viscous, spring, y, v, u0, u1, peak)
         if direction * v_peak < 0.0:
             return _root(_VELOCITY, mass, viscous, spring, y, v, u0, u1, 0.0, peak, direction < 0.0)
-    else:
-        peak = 0.0
     if direction * v_end < 0.0:
         return _root(_VELOCITY, mass, viscous, spring, y, v, u0, u1, peak, span, direction < 0.0)
     return span
 
 
 @compiled
+def _is_inside(plant: Record, y: float, v: float, pull: float) -> bool:
+    """Whether the wall acts: on the threshold the motion decides, at rest what pulls."""
+    if plant.wall_stiffness == 0.0 and plant.wall_damping == 0.0:
+        return False
+    return y < 0.0 or (y == 0.0 and (v < 0.0 or (v == 0.0 and pull < 0.0)))
+
+
+@compiled
+def _segment(
+    plant: Record, y: float, v: float, u0: float, u1: float, remaining: float, inside: bool
+) -> tuple[float, float, float]:
+    """Motion up to the next event, no longer than `remaining`: (duration, y, ẏ).
+
+    At a crossing of the wall y is 0 exactly, at a reversal ẏ is; both are what the next segment
+    recognises them by.
+    """
+    viscous = plant.viscous + (plant.wall_damping if inside else 0.0)
+    spring = plant.spring + (plant.wall_stiffness if inside else 0.0)
+    stuck = 0.0
+    if v != 0.0:
+        direction = 1.0 if v > 0.0 else -1.0
+        force = u0 - direction * plant.coulomb
+    else:
+        pull = u0 - spring * y
+        if abs(pull) > plant.coulomb:
+            direction = 1.0 if pull > 0.0 else -1.0
+            force = u0 - direction * plant.coulomb
+        else:
+            # Stuck until the ramp of the external force breaks it loose, if it does.
+            if u1 == 0.0:
+                return remaining, y, v
+            direction = 1.0 if u1 > 0.0 else -1.0
+            stuck = (plant.coulomb - direction * pull) / abs(u1)
+            if stuck >= remaining:
+                return remaining, y, v
+            # Friction and spring balance to the last bit here; recomputed from u₀ + u₁·t the
+            # acceleration could come out with the wrong sign and end the slip at once.
+            force = spring * y
+    omega = math.sqrt(spring / plant.mass)
+    span = remaining - stuck
+    if omega > 0.0:
+        span = min(span, 0.5 * math.pi / omega)
+    # Up to its reversal the velocity keeps its sign, so the position is monotone.
+    dt = _reversal(plant.mass, viscous, spring, y, v, force, u1, direction, span)
+    y_end, v_end = flow(plant.mass, viscous, spring, y, v, force, u1, dt)
+    leaves = inside and direction > 0.0 and y_end >= 0.0
+    enters = not inside and direction < 0.0 and y_end < 0.0
+    if leaves or (enters and _is_inside(plant, y_end, v_end, 0.0)):
+        dt = _root(
+            _POSITION, plant.mass, viscous, spring, y, v, force, u1, 0.0, dt, direction > 0.0
+        )
+        _, v_end = flow(plant.mass, viscous, spring, y, v, force, u1, dt)
+        return stuck + dt, 0.0, v_end
+    if dt < span or direction * v_end <= 0.0:
+        v_end = 0.0
+    return stuck + dt, y_end, v_end
+
+
+@compiled
 def advance(
     plant: Record, y: float, v: float, u0: float, u1: float, duration: float
-) -> tuple[float, float]:
+) -> tuple[float, float, bool]:
     """State (y, ẏ) after `duration` under the external force u₀ + u₁·t, from (y, v).
 
-    plant is a record of dtype PLANT, y is measured from the wall (y < 0 inside). Coulomb friction
-    is set-valued at rest: the handle sticks as long as what pulls it stays within ±coulomb, and
-    starts to slip at the very instant at which it no longer does.
+    plant is a record of dtype PLANT, y is measured from the wall (y < 0 inside). The third value
+    tells whether the wall acted at any time. Coulomb friction is set-valued at rest: the handle
+    sticks as long as what pulls it stays within ±coulomb, and starts to slip at the very instant
+    at which it no longer does.
     """
-    has_wall = plant.wall_stiffness > 0.0 or plant.wall_damping > 0.0
     t = 0.0
+    touched = False
     for _ in range(MAX_EVENTS):
         if not t < duration:
-            return y, v
+            return y, v, touched
         u = u0 + u1 * t
-        # On the threshold the direction of motion decides, at rest what presses on the handle.
-        inside = has_wall and (
-            y < 0.0 or (y == 0.0 and (v < 0.0 or (v == 0.0 and u - plant.spring * y < 0.0)))
-        )
-        viscous = plant.viscous + (plant.wall_damping if inside else 0.0)
-        spring = plant.spring + (plant.wall_stiffness if inside else 0.0)
+        inside = _is_inside(plant, y, v, u - plant.spring * y)
+        touched = touched or inside
         remaining = duration - t
-        if v == 0.0:
-            pull = u - spring * y
-            if abs(pull) <= plant.coulomb:
-                # Stuck until the ramp of the external force breaks it loose, if it does.
-                slack = plant.coulomb - pull if u1 > 0.0 else plant.coulomb + pull
-                breakaway = slack / abs(u1) if u1 != 0.0 else math.inf
-                if breakaway >= remaining:
-                    return y, v
-                t += breakaway
-                remaining -= breakaway
-                direction = 1.0 if u1 > 0.0 else -1.0
-                # Friction and spring balance to the last bit here; recomputed from u₀ + u₁·t the
-                # acceleration could come out with the wrong sign and end the slip at once.
-                force = spring * y
-            else:
-                direction = 1.0 if pull > 0.0 else -1.0
-                force = u - direction * plant.coulomb
-        else:
-            direction = 1.0 if v > 0.0 else -1.0
-            force = u - direction * plant.coulomb
-        omega = math.sqrt(spring / plant.mass)
-        span = min(remaining, 0.5 * math.pi / omega) if omega > 0.0 else remaining
-        # Up to its reversal the velocity keeps its sign, so the position is monotone.
-        dt = _reversal(plant.mass, viscous, spring, y, v, force, u1, direction, span)
-        y_end, v_end = flow(plant.mass, viscous, spring, y, v, force, u1, dt)
-        reversed_here = direction * v_end <= 0.0 or dt < span
-        leaves = inside and direction > 0.0 and y_end >= 0.0
-        enters = has_wall and not inside and direction < 0.0 and y_end < 0.0
-        if leaves or enters:
-            dt = _root(
-                _POSITION, plant.mass, viscous, spring, y, v, force, u1, 0.0, dt, direction > 0.0
-            )
-            _, v = flow(plant.mass, viscous, spring, y, v, force, u1, dt)
-            y = 0.0
-        else:
-            y = y_end
-            v = 0.0 if reversed_here else v_end
+        dt, y, v = _segment(plant, y, v, u, u1, remaining, inside)
         t = duration if dt >= remaining else t + dt
-    return math.nan, math.nan
+    return math.nan, math.nan, touched
+
+
+@compiled
+def time_to_wall(plant: Record, y: float, v: float, u: float, duration: float) -> float:
+    """When a handle outside (y ≥ 0) that would be inside after `duration` crosses y = 0.
+
+    Free motion under the constant force u, no friction: the one crossing that the sign change at
+    the end of the interval vouches for.
+    """
+    return _root(
+        _POSITION, plant.mass, plant.viscous, plant.spring, y, v, u, 0.0, 0.0, duration, False
+    )
+
+
+#: Segments (of a quarter period each, at most) after which a contact is taken for one that does
+#: not end: overdamped, it creeps towards its rest without ever turning round.
+_CONTACT_SEGMENTS = 64
+
+
+@compiled
+def contact_end(plant: Record, y: float, v: float, u: float, horizon: float) -> tuple[float, float]:
+    """Time until the contact that lies ahead, or is on, has ended, and the velocity then.
+
+    From (y, v) under the constant force u. (inf, 0) where no contact begins within `horizon`, or
+    where it never ends: a handle that turns round again inside the wall stays there.
+    """
+    t = 0.0
+    entered = False
+    for _ in range(_CONTACT_SEGMENTS):
+        inside = _is_inside(plant, y, v, u - plant.spring * y)
+        if entered and not inside:
+            return t, v
+        if not inside and t >= horizon:
+            break
+        outward = v > 0.0
+        entered = entered or inside
+        dt, y, v = _segment(plant, y, v, u, 0.0, math.inf if inside else horizon - t, inside)
+        t += dt
+        if inside and v == 0.0 and (outward or not dt < math.inf):
+            break
+    return math.inf, 0.0

@@ -18,6 +18,7 @@ from canwall.compiled import compiled
 # of the first before its own factor s_n ≤ 2^-12 enters: beneath the rounding of a double.
 _TERMS = 14
 _REACH = 0.5
+_INVERSE_FACTORIALS = tuple(1.0 / math.factorial(n) for n in range(_TERMS + 3))
 _MAX_DOUBLINGS = 60
 
 
@@ -45,13 +46,11 @@ def basis(
     # integrals are the same sum with the factorial shifted by one place, ...
     h1 = h0 = g1 = g2 = 0.0
     term, following = 1.0, -p
-    factorial = 1.0  # (n − 1)!
-    for n in range(1, _TERMS + 1):
-        h1 += term / factorial
-        h0 += term / (factorial * n)
-        g1 += term / (factorial * n * (n + 1))
-        g2 += term / (factorial * n * (n + 1) * (n + 2))
-        factorial *= n
+    for n in range(_TERMS):
+        h1 += term * _INVERSE_FACTORIALS[n]
+        h0 += term * _INVERSE_FACTORIALS[n + 1]
+        g1 += term * _INVERSE_FACTORIALS[n + 2]
+        g2 += term * _INVERSE_FACTORIALS[n + 3]
         term, following = following, -p * following - q * term
     h0 *= t
     g1 *= t * t

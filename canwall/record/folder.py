@@ -16,6 +16,8 @@ def read_signals(path: Path) -> pa.Table:
     """signals.parquet as a table. Raises ConfigError where it is missing or not readable."""
     try:
         return pq.read_table(path)
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; give the folder of a run") from None
     except (OSError, pa.ArrowInvalid) as error:
         reason = str(error).splitlines()[0]
         raise ConfigError(f"{path}: not a record of a run: {reason}") from None

@@ -34,6 +34,7 @@ class Recorder:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 pass_fds=[self.ring.descriptor],
+                start_new_session=True,  # Ctrl-C is meant for the master, who ends the writer
             )
         except OSError as error:
             raise RecordError(

@@ -6,8 +6,8 @@ first. Its last words go to standard output as JSON: what was written and what w
 
 import contextlib
 import json
+import os
 import select
-import signal
 import sys
 from pathlib import Path
 
@@ -90,8 +90,6 @@ def write(ring: Ring, folder: Path, bus_log: str, channel: str, laws: list[str])
 
 def main() -> None:
     """Arguments: descriptor of the ring, folder, name of the bus log, channel, laws as JSON."""
-    # Ctrl-C is meant for the master; it tells the writer in its own way.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     descriptor, folder, bus_log, channel, laws = sys.argv[1:]
     error = ""
     ring = Ring(int(descriptor))
@@ -103,8 +101,9 @@ def main() -> None:
         while not select.select([sys.stdin], [], [], _POLL_S)[0]:
             ring.take_frames()
             ring.take_rows()
+    # Written past sys.stdout, which would complain at exit that a dead master does not listen.
     with contextlib.suppress(BrokenPipeError):
-        print(json.dumps({"error": error}), flush=True)
+        os.write(sys.stdout.fileno(), json.dumps({"error": error}).encode())
 
 
 if __name__ == "__main__":

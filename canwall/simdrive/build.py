@@ -1,4 +1,4 @@
-"""A simulated drive from a configuration: `[drive]` its dictionary, `[simulation]` its mechanics."""
+"""A simulated drive from `[drive]` (its dictionary) and `[simulation]` (its mechanics)."""
 
 from canwall.config import Drive as DriveSettings
 from canwall.config import Simulation

@@ -71,7 +71,7 @@ class ServoMotion:
         """One period of the script under a held torque."""
         if self._elapsed >= len(self._constant):
             self._lay_out(2 * len(self._constant))
-        self.position_rad, self.speed_rad_s = advance(
+        self.position_rad, self.speed_rad_s, _ = advance(
             self._plant,
             self.position_rad,
             self.speed_rad_s,

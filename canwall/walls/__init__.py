@@ -1,4 +1,4 @@
-"""The laws of the virtual wall: a file per law, the estimator, the registry.
+"""The laws of the virtual wall: a file per law, the estimator, the layers, the registry.
 
 A law is one function from the record of one wall (`WALL`) to the force that pushes the operator
 out of it. Nothing here knows of CAN, counts or drives.
@@ -13,13 +13,25 @@ from canwall.walls.estimator import (
     reset_estimator,
     set_estimator,
 )
-from canwall.walls.interface import WALL, call_law, law, set_plant
-from canwall.walls.registry import LAWS, Law, UnknownLawError, find_law
+from canwall.walls.interface import (
+    HORIZON,
+    WALL,
+    call_law,
+    forget,
+    law,
+    set_plant,
+    set_referent,
+)
+from canwall.walls.layers import TENSION, note_force, wall_force
+from canwall.walls.registry import DEADBEAT, LAWS, Law, UnknownLawError, find_law
 
 __all__ = [
+    "DEADBEAT",
     "ESTIMATOR",
+    "HORIZON",
     "LAWS",
     "MAX_DELAY",
+    "TENSION",
     "WALL",
     "Law",
     "UnknownLawError",
@@ -27,9 +39,13 @@ __all__ = [
     "call_law",
     "commit",
     "find_law",
+    "forget",
     "law",
+    "note_force",
     "observe",
     "reset_estimator",
     "set_estimator",
     "set_plant",
+    "set_referent",
+    "wall_force",
 ]

@@ -138,7 +138,12 @@ def observe(estimator: Record, y_sample: float) -> None:
 def actuation_state(estimator: Record) -> tuple[float, float]:
     """State (ŷ, ẏ̂) at the instant at which the force computed now takes effect."""
     n = estimator.delay_periods
-    y, v = _hold(estimator, estimator.before[0], estimator.y, estimator.v, estimator.committed[n] + estimator.d
+    y, v = _hold(
+        estimator,
+        estimator.before[0],
+        estimator.y,
+        estimator.v,
+        estimator.committed[n] + estimator.d,
     )
     for age in range(n - 1, -1, -1):
         y, v = _hold(estimator, estimator.full[0], y, v, estimator.committed[age] + estimator.d)
@@ -153,8 +158,12 @@ def commit(estimator: Record, force: float) -> None:
     """
     n = estimator.delay_periods
     committed = estimator.committed
-    y, v = _hold(estimator, estimator.before[0], estimator.y, estimator.v, committed[n] + estimator.d)
+    y, v = _hold(
+        estimator, estimator.before[0], estimator.y, estimator.v, committed[n] + estimator.d
+    )
     for age in range(MAX_DELAY, 0, -1):
         committed[age] = committed[age - 1]
     committed[0] = force
-    estimator.y, estimator.v = _hold(estimator, estimator.after[0], y, v, committed[n] + estimator.d)
+    estimator.y, estimator.v = _hold(
+        estimator, estimator.after[0], y, v, committed[n] + estimator.d
+    )

@@ -5,14 +5,15 @@ damping is the plant's and the wall's together, and the bias force moves its equ
 Table 5.4 writes the argument as t + T/2; it restarts at every sample and carries ω₀.
 """
 
-from canwall.compiled import Record
+from canwall.compiled import Record, compiled
 from canwall.physics import flow
+from canwall.walls.deadbeat import compensated
 from canwall.walls.interface import law
 
 
-@law
-def half_sample(wall: Record) -> float:
-    """f = −K·y(T/2) − B·ẏ(T/2) of the referent while the state at actuation is inside."""
+@compiled
+def predicted_force(wall: Record) -> float:
+    """−K·y(T/2) − B·ẏ(T/2) of the referent while the state at actuation is inside."""
     if wall.y >= 0.0:
         return 0.0
     y_half, v_half = flow(
@@ -26,3 +27,15 @@ def half_sample(wall: Record) -> float:
         0.5 * wall.period,
     )
     return -wall.stiffness * y_half - wall.damping * v_half
+
+
+@law
+def half_sample(wall: Record) -> float:
+    """f = −K·y(T/2) − B·ẏ(T/2) of the referent while the state at actuation is inside."""
+    return predicted_force(wall)
+
+
+@law
+def half_sample_deadbeat(wall: Record) -> float:
+    """The same, with the last two forces of each contact from the deadbeat compensation."""
+    return compensated(wall, predicted_force(wall))

@@ -1,12 +1,16 @@
 """The plain wall: a spring on the sampled position (Table 5.1, with the sign put right)."""
 
-from canwall.compiled import Record
+from canwall.compiled import Record, compiled
 from canwall.walls.interface import law
+
+
+@compiled
+def spring(wall: Record) -> float:
+    """−K·y[j] while the sample is inside."""
+    return -wall.stiffness * wall.y_sample if wall.y_sample < 0.0 else 0.0
 
 
 @law
 def standard(wall: Record) -> float:
     """f = −K·y[j] while the sample is inside."""
-    if wall.y_sample >= 0.0:
-        return 0.0
-    return -wall.stiffness * wall.y_sample
+    return spring(wall)

@@ -1,0 +1,26 @@
+"""The exponential spring: soft at the surface, ever stiffer inside.
+
+One of Rosenberg's variants (section 5.2.2). K is the stiffness at the surface; each further
+`length` of depth makes the wall e times as stiff.
+"""
+
+import math
+
+from canwall.compiled import Record
+from canwall.walls.interface import law
+
+#: length: depth over which the stiffness grows by a factor e.
+OPTIONS = {"length": 0.02}
+
+# Beyond it exp() would overflow; no drive reaches the forces that go with it.
+_LARGEST_EXPONENT = 50.0
+
+
+@law
+def exponential(wall: Record) -> float:
+    """f = K·L·(exp(−y[j]/L) − 1) while the sample is inside."""
+    if wall.y_sample >= 0.0:
+        return 0.0
+    length = wall.options[0]
+    depth = min(-wall.y_sample / length, _LARGEST_EXPONENT)
+    return wall.stiffness * length * math.expm1(depth)

@@ -1,0 +1,24 @@
+"""A spring with hysteresis: it releases earlier, or softer, than it engages.
+
+Lost energy on the way out pays for what sampling adds. Both kinds in one: the wall engages at
+the surface and releases at `release` inside it, and while the handle leaves, its stiffness is
+`softening` times K.
+"""
+
+from canwall.compiled import Record
+from canwall.walls.interface import law
+
+#: softening: stiffness on the way out over K; release: depth at which the wall lets go.
+OPTIONS = {"softening": 0.8, "release": 0.0}
+
+
+@law
+def hysteresis(wall: Record) -> float:
+    """f = −K·y[j] moving in, −softening·K·y[j] moving out, 0 above −release moving out."""
+    if wall.y_sample >= 0.0:
+        return 0.0
+    if wall.v_sample <= 0.0:
+        return -wall.stiffness * wall.y_sample
+    if wall.y_sample > -wall.options[1]:
+        return 0.0
+    return -wall.options[0] * wall.stiffness * wall.y_sample

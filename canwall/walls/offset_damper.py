@@ -1,0 +1,21 @@
+"""A damped wall whose damper begins at another depth than its spring.
+
+One of Rosenberg's variants (section 5.2.2). With the damper deeper than the spring the release
+is clean; with it before the surface the approach is braked.
+"""
+
+from canwall.compiled import Record
+from canwall.walls.interface import law
+from canwall.walls.standard import spring
+
+#: offset: where the damper begins, relative to the spring's surface (negative: inside).
+OPTIONS = {"offset": -0.002}
+
+
+@law
+def offset_damper(wall: Record) -> float:
+    """f = −K·y[j] inside, −B·ẏ[j] below the offset."""
+    force = spring(wall)
+    if wall.y_sample < wall.options[0]:
+        force -= wall.damping * wall.v_sample
+    return force

@@ -1,0 +1,56 @@
+"""Design in the digital domain (5.12, 5.13): state feedback that places the referent's poles.
+
+The sampled plant gets the eigenvalues of the continuous mass on the wall (Ackermann; the chapter
+says Aizerman). It matches how fast the motion turns and decays, not its samples: the amplitude
+of the position is off by (θ/2)/tan(θ/2).
+"""
+
+from canwall.compiled import Record, compiled
+from canwall.physics import zoh_coefficients
+from canwall.walls.deadbeat import compensated
+from canwall.walls.interface import law
+
+
+@compiled
+def placing_gains(wall: Record) -> tuple[float, float]:
+    """k of f = −k·x, from Ackermann's formula k = [0 1]·[Γ ΦΓ]⁻¹·p(Φ)."""
+    r11, r12, r21, r22, _, _ = zoh_coefficients(
+        wall.mass, wall.viscous + wall.damping, wall.spring + wall.stiffness, wall.period
+    )
+    trace, determinant = r11 + r22, r11 * r22 - r12 * r21
+    phi, gamma = wall.phi, wall.gamma
+    g1, g2 = gamma[0], gamma[1]
+    h1 = phi[0, 0] * g1 + phi[0, 1] * g2
+    h2 = phi[1, 0] * g1 + phi[1, 1] * g2
+    # By Cayley-Hamilton p(Φ) = (tr Φ − tr)·Φ + (det − det Φ)·I, without cancellation of squares.
+    own_trace = phi[0, 0] + phi[1, 1]
+    own_determinant = phi[0, 0] * phi[1, 1] - phi[0, 1] * phi[1, 0]
+    a, b = own_trace - trace, determinant - own_determinant
+    area = g1 * h2 - g2 * h1  # det [Γ ΦΓ]
+    # The last row of its inverse is [−g2, g1]/area.
+    k1 = (-g2 * (a * phi[0, 0] + b) + g1 * a * phi[1, 0]) / area
+    k2 = (-g2 * a * phi[0, 1] + g1 * (a * phi[1, 1] + b)) / area
+    return k1, k2
+
+
+@compiled
+def placed_force(wall: Record) -> float:
+    """State feedback about the equilibrium under the bias force, while inside."""
+    if wall.y >= 0.0 or wall.stiffness == 0.0:
+        return 0.0
+    k1, k2 = placing_gains(wall)
+    # Under a bias force the wall's equilibrium has to be kept: there it holds −K·y_eq.
+    y_eq = wall.d / (wall.spring + wall.stiffness)
+    return -wall.stiffness * y_eq - k1 * (wall.y - y_eq) - k2 * wall.v
+
+
+@law
+def pole_placement(wall: Record) -> float:
+    """f = −K·y_eq − k·(x − x_eq) while the state at actuation is inside."""
+    return placed_force(wall)
+
+
+@law
+def pole_placement_deadbeat(wall: Record) -> float:
+    """The same, with the last two forces of each contact from the deadbeat compensation."""
+    return compensated(wall, placed_force(wall))

@@ -1,0 +1,21 @@
+"""A damped wall whose damper is deaf to slow motion.
+
+One of Rosenberg's variants (section 5.2.2). Below the threshold the velocity of a quantised
+position is mostly noise; leaving it out lets the damping be higher.
+"""
+
+from canwall.compiled import Record
+from canwall.walls.interface import law
+
+#: threshold: speed up to which nothing is damped.
+OPTIONS = {"threshold": 0.1}
+
+
+@law
+def thresholded_damper(wall: Record) -> float:
+    """f = −K·y[j] − B·(ẏ[j] beyond ±threshold) while the sample is inside."""
+    if wall.y_sample >= 0.0:
+        return 0.0
+    threshold = wall.options[0]
+    beyond = wall.v_sample - min(max(wall.v_sample, -threshold), threshold)
+    return -wall.stiffness * wall.y_sample - wall.damping * beyond

@@ -1,0 +1,122 @@
+"""The bouncing ball: driven by held forces (Table 5.2), and on the continuous floor (Table 5.3).
+
+m·ÿ + b·ẏ + k_h·y = f − m·g over the floor at y = 0. The law gets the exact state and the exact
+bias force, and its force takes effect at once: D = 0.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canwall.compiled import Record, compiled
+from canwall.errors import InputError
+from canwall.physics import advance, make_plant
+from canwall.walls import TENSION, WALL, Law, note_force, set_plant, set_referent, wall_force
+from canwall.walls.interface import free_step
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Ball:
+    """What bounces on what, from where, sampled how often.
+
+    Units: kg, N·s/m, N/m, m/s², m, s, or any other consistent set. Raises InputError for what no
+    ball can be.
+    """
+
+    stiffness: float = 1.0
+    damping: float = 0.0
+    mass: float = 1.0
+    viscous: float = 0.0
+    spring: float = 0.0
+    gravity: float = 1.0
+    height: float = 1.0
+    speed: float = 0.0
+    period: float = 0.1
+    periods: int = 3000
+    options: tuple[float, ...] = field(default=())
+    tension: str = "allow"
+
+    def __post_init__(self) -> None:
+        for name in ("mass", "period"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
+                raise InputError(f"{name} has to be a number above 0, not {getattr(self, name):g}")
+        for name in ("stiffness", "damping", "viscous", "spring"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
+                raise InputError(f"{name} has to be 0 or above, not {getattr(self, name):g}")
+        for name in ("gravity", "height", "speed"):
+            if not math.isfinite(getattr(self, name)):
+                raise InputError(f"{name} has to be a number, not {getattr(self, name):g}")
+        if self.periods < 0:
+            raise InputError(f"periods has to be 0 or above, not {self.periods}")
+
+    @property
+    def theta(self) -> float:
+        """θ = T·√(K/m): how hard the floor is for its sample rate."""
+        return self.period * math.sqrt(self.stiffness / self.mass)
+
+    def energy(self, y: Array, v: Array) -> Array:
+        """Energy of the ball, with what the floor's spring holds of it; any shape."""
+        floor = np.where(y < 0.0, self.stiffness, 0.0)
+        potential = self.mass * self.gravity * y + 0.5 * (self.spring + floor) * y * y
+        return np.asarray(0.5 * self.mass * v * v + potential)
+
+
+def sampled_ball(ball: Ball, law: Law) -> tuple[Array, Array, Array]:
+    """(y, ẏ, f) at the samples 0 … periods, each of shape (periods + 1,); the last f is 0.
+
+    f[j] is held from sample j to the next.
+    """
+    wall = np.zeros(1, WALL)
+    set_plant(wall, ball.mass, ball.viscous, ball.spring, ball.period)
+    set_referent(wall, ball.stiffness, ball.damping, ball.options)
+    wall["tension"] = TENSION[ball.tension]
+    wall["d"] = -ball.mass * ball.gravity
+    trajectory = np.zeros((3, ball.periods + 1))
+    bounce(wall, law.address, ball.height, ball.speed, trajectory)
+    return trajectory[0], trajectory[1], trajectory[2]
+
+
+@compiled
+def bounce(walls: NDArray[np.void], address: int, y: float, v: float, trajectory: Array) -> None:
+    """Fill (y, ẏ, f), shape (3, n + 1), from the state (y, v); walls has dtype WALL, shape (1,)."""
+    wall: Record = walls[0]
+    periods = trajectory.shape[1] - 1
+    y_before = y
+    for j in range(periods):
+        wall.y = wall.y_sample = y
+        # At the first sample there is no difference yet; then it is the backward difference.
+        wall.v = v
+        wall.v_sample = v if j == 0 else (y - y_before) / wall.period
+        force = wall_force(address, wall)
+        note_force(wall, force)
+        trajectory[0, j] = y
+        trajectory[1, j] = v
+        trajectory[2, j] = force
+        y_before = y
+        y, v = free_step(wall, y, v, force)
+    trajectory[0, periods] = y
+    trajectory[1, periods] = v
+
+
+def continuous_ball(ball: Ball) -> tuple[Array, Array, Array]:
+    """(y, ẏ, f) of the ball on the continuous floor, at the same samples as `sampled_ball`.
+
+    f is the floor's force at the sample; the last is 0, as there.
+    """
+    plant = make_plant(ball.mass, ball.viscous, ball.spring, 0.0, ball.stiffness, ball.damping)
+    y, v = np.zeros(ball.periods + 1), np.zeros(ball.periods + 1)
+    y[0], v[0] = ball.height, ball.speed
+    _follow(plant, -ball.mass * ball.gravity, ball.period, y, v)
+    force = np.where(y < 0.0, -ball.stiffness * y - ball.damping * v, 0.0)
+    force[-1] = 0.0
+    return y, v, force
+
+
+@compiled
+def _follow(plants: NDArray[np.void], bias: float, period: float, y: Array, v: Array) -> None:
+    for j in range(len(y) - 1):
+        y[j + 1], v[j + 1], _ = advance(plants[0], y[j], v[j], bias, 0.0, period)
