@@ -12,7 +12,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from canwall import config
-from canwall.config import ConfigError, Settings
+from canwall.config import ConfigError, Settings, absolute_law
 from canwall.errors import InputError, RunFailedError
 
 app = typer.Typer(
@@ -56,7 +56,7 @@ def run(
     """
     settings = _settings(
         config_file,
-        wall__law=law,
+        wall__law=law and absolute_law(law, Path()),
         wall__stiffness_nm_per_rad=stiffness,
         wall__damping_nm_s_per_rad=damping,
         run__duration_s=duration,
@@ -111,6 +111,69 @@ def plot(
 
     _console.print(str(plot_run(RunFolder(folder))), soft_wrap=True, highlight=False)
     return 0
+
+
+@app.command()
+def ball(
+    law: Annotated[str, typer.Option(help="Law of the floor, or 'continuous' for its referent.")],
+    output: Annotated[Path, typer.Option(help="CSV file: t, y, v, f.")],
+    stiffness: Annotated[float, typer.Option(help="Floor's stiffness K [N/m].")] = 1.0,
+    damping: Annotated[float, typer.Option(help="Floor's damping B [N·s/m].")] = 0.0,
+    mass: Annotated[float, typer.Option(help="Ball's mass m [kg].")] = 1.0,
+    viscous: Annotated[float, typer.Option(help="Ball's viscous damping b [N·s/m].")] = 0.0,
+    spring: Annotated[float, typer.Option(help="Spring k_h on the ball [N/m].")] = 0.0,
+    gravity: Annotated[float, typer.Option(help="Gravity g [m/s²].")] = 1.0,
+    height: Annotated[float, typer.Option(help="Height at the start [m].")] = 1.0,
+    speed: Annotated[float, typer.Option(help="Velocity at the start [m/s].")] = 0.0,
+    period: Annotated[float, typer.Option(help="Sampling period T [s].")] = 0.1,
+    periods: Annotated[int, typer.Option(help="How many periods.")] = 3000,
+    deadbeat: Annotated[bool, typer.Option("--deadbeat", help="Add the compensation.")] = False,
+    tension: Annotated[str, typer.Option(help="allow, clamp or budget.")] = "allow",
+    option: Annotated[list[str] | None, typer.Option(help="Law's option, NAME=VALUE.")] = None,
+) -> int:
+    """A ball bouncing on a floor that is the wall: exact state, no delay, held force."""
+    from canwall.workbench import CONTINUOUS, Ball, bounced, write_ball
+
+    ball = Ball(
+        stiffness=stiffness,
+        damping=damping,
+        mass=mass,
+        viscous=viscous,
+        spring=spring,
+        gravity=gravity,
+        height=height,
+        speed=speed,
+        period=period,
+        periods=periods,
+        tension=tension,
+    )
+    if law == CONTINUOUS and (deadbeat or option):
+        raise InputError("--law continuous is no law: it has no --deadbeat and no --option")
+    name = law if law == CONTINUOUS else absolute_law(law, Path())
+    y, v, force = bounced(ball, name, deadbeat, _named_numbers(option or []))
+    write_ball(output, ball, y, v, force)
+    energy = ball.energy(y, v)
+    last = int((y >= 0.0).nonzero()[0].max(initial=0))
+    _console.print(
+        f"θ = {ball.theta:g}; energy {energy[0]:.9g} at the start, {energy[last]:.9g} at the last "
+        f"sample outside (t = {last * period:g})",
+        highlight=False,
+        soft_wrap=True,
+    )
+    return 0
+
+
+def _named_numbers(given: list[str]) -> dict[str, float]:
+    numbers = {}
+    for text in given:
+        name, equals, value = text.partition("=")
+        try:
+            numbers[name] = float(value)
+        except ValueError:
+            equals = ""
+        if not equals:
+            raise InputError(f"--option {text}: has to be NAME=NUMBER")
+    return numbers
 
 
 class _RunProgress:

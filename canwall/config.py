@@ -294,15 +294,16 @@ def load(path: Path, overrides: Mapping[str, Any] | None = None) -> Settings:
 def _with_absolute_paths(settings: Settings, base: Path) -> Settings:
     """The files that a configuration names, independent of where it lies."""
     drive = settings.drive.model_copy(update={"eds": (base / settings.drive.eds).resolve()})
-    wall = settings.wall.model_copy(update={"law": _absolute_law(settings.wall.law, base)})
+    wall = settings.wall.model_copy(update={"law": absolute_law(settings.wall.law, base)})
     schedule = tuple(
-        change.model_copy(update={"law": change.law and _absolute_law(change.law, base)})
+        change.model_copy(update={"law": change.law and absolute_law(change.law, base)})
         for change in settings.schedule
     )
     return settings.model_copy(update={"drive": drive, "wall": wall, "schedule": schedule})
 
 
-def _absolute_law(law: str, base: Path) -> str:
+def absolute_law(law: str, base: Path) -> str:
+    """A law's name; where it names a user's file, that file's path no longer relative to base."""
     path, colon, function = law.rpartition(":")
     return f"{(base / path).resolve()}:{function}" if colon else law
 

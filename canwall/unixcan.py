@@ -370,7 +370,8 @@ class UnixBus(can.BusABC):
         old.close()
         self._link = new
         self._epoll.register(new, select.EPOLLIN)
-        log.info("%s: the hub left, rejoined as %s", self.channel_info, type(new).__name__)
+        role = "hub" if isinstance(new, _Hub) else "client"
+        log.info("%s: the hub left, rejoined as %s", self.channel_info, role)
         return True
 
     def _require_open(self) -> None:

@@ -259,8 +259,10 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     row: Record = rows[0]
     wall = cycle.wall[0]
     estimator = cycle.estimator[0]
+    elapsed = cycle.period
     if received:
         read_inputs(cycles, data)
+        elapsed *= 1 + cycle.missed_in_a_row
         cycle.missed_in_a_row = 0
     else:
         cycle.torque_actual = cycle.torque_per_mille
@@ -274,7 +276,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     if received:
         observe(estimator, oriented)
     wall.y_sample = oriented - origin
-    wall.v_sample = (oriented - cycle.y_before) / cycle.period
+    wall.v_sample = (oriented - cycle.y_before) / elapsed
     if cycle.estimated_velocity:
         wall.v_sample = estimator.v
     cycle.y_before = oriented

@@ -145,8 +145,10 @@ class _Sdo(SdoClient):  # type: ignore[misc]
         super().send_request(request)
 
     def on_response(self, can_id: int, data: bytearray, timestamp: float) -> None:
-        # What comes too late for the request before, or for another master, answers nothing.
-        if data[0] >> 5 not in _INITIATE_RESPONSES or data[1:4] == self._requested:
+        # What comes too late for the request before, or for another master, answers nothing; nor
+        # does what is no SDO (which always has 8 bytes).
+        first = len(data) == 8 and data[0] >> 5 in _INITIATE_RESPONSES
+        if len(data) == 8 and (not first or data[1:4] == self._requested):
             super().on_response(can_id, data, timestamp)
 
     def read_response(self) -> bytes:

@@ -68,7 +68,6 @@ class Axis:
         self._negative_limit = number(0x60E1, absent=_INT32)
         self._follows_target = False
         self._limited = False
-        self._halt = False
         self.state_machine = StateMachine(dictionary, self._refresh)
         self._abort_option.allow((_NO_ACTION, _FAULT, _DISABLE_VOLTAGE, _QUICK_STOP))
         self._mode.allow((NO_MODE, CYCLIC_SYNCHRONOUS_TORQUE)).react = lambda _: self._refresh()
@@ -76,7 +75,6 @@ class Axis:
 
     def reset(self) -> None:
         """Begin in NOT READY TO SWITCH ON, with the objects as they stand."""
-        self._halt = False
         self.state_machine.reset()
         self.sample()
 
@@ -128,19 +126,16 @@ class Axis:
         self._velocity.value = max(-_INT32, min(_INT32 - 1, speed))
 
     def _control(self, controlword: int) -> None:
-        halt = bool(controlword & _HALT)
-        if halt is not self._halt:
-            self._halt = halt
-            self._refresh()
         self.state_machine.control(controlword)
+        self._refresh()
 
     def _refresh(self) -> None:
-        """Follow a change of state, mode or halt."""
+        """Follow a change of state, mode or controlword."""
         self._mode_display.value = self._mode.value
         self._follows_target = (
             self.state_machine.state is State.OPERATION_ENABLED
             and self._mode.value == CYCLIC_SYNCHRONOUS_TORQUE
-            and not self._halt
+            and not self._controlword.value & _HALT
         )
         if not self._follows_target:
             self._actual_torque.value = 0

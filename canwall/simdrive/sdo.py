@@ -149,8 +149,6 @@ class SdoServer:
         _check_toggle(data, download.toggle)
         download.data += data[1 : 1 + _SEGMENT_SIZE - (head >> 1 & 7)]
         _check_memory(len(download.data))
-        if download.size is not None and len(download.data) > download.size:
-            raise AccessError(AbortCode.LENGTH)
         if head & _LAST_SEGMENT:
             if download.size is not None and len(download.data) != download.size:
                 raise AccessError(AbortCode.LENGTH)

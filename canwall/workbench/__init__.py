@@ -4,6 +4,13 @@ The ball is the handle with everything left out that a bench adds: exact state, 
 quantisation. What a law does wrong here is the law's own.
 """
 
-from canwall.workbench.ball import Ball, continuous_ball, sampled_ball
+from canwall.workbench.ball import (
+    CONTINUOUS,
+    Ball,
+    bounced,
+    continuous_ball,
+    sampled_ball,
+    write_ball,
+)
 
-__all__ = ["Ball", "continuous_ball", "sampled_ball"]
+__all__ = ["CONTINUOUS", "Ball", "bounced", "continuous_ball", "sampled_ball", "write_ball"]

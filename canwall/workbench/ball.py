@@ -5,7 +5,10 @@ bias force, and its force takes effect at once: D = 0.
 """
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +16,22 @@ from numpy.typing import NDArray
 from canwall.compiled import Record, compiled
 from canwall.errors import InputError
 from canwall.physics import advance, make_plant
-from canwall.walls import TENSION, WALL, Law, note_force, set_plant, set_referent, wall_force
+from canwall.walls import (
+    TENSION,
+    WALL,
+    Law,
+    find_law,
+    note_force,
+    set_plant,
+    set_referent,
+    wall_force,
+)
 from canwall.walls.interface import free_step
 
 Array = NDArray[np.float64]
+
+#: What stands for a law's name where the continuous referent is meant.
+CONTINUOUS = "continuous"
 
 
 @dataclass(frozen=True)
@@ -37,7 +52,6 @@ class Ball:
     speed: float = 0.0
     period: float = 0.1
     periods: int = 3000
-    options: tuple[float, ...] = field(default=())
     tension: str = "allow"
 
     def __post_init__(self) -> None:
@@ -52,6 +66,8 @@ class Ball:
                 raise InputError(f"{name} has to be a number, not {getattr(self, name):g}")
         if self.periods < 0:
             raise InputError(f"periods has to be 0 or above, not {self.periods}")
+        if self.tension not in TENSION:
+            raise InputError(f"tension has to be one of {', '.join(TENSION)}, not {self.tension!r}")
 
     @property
     def theta(self) -> float:
@@ -65,14 +81,38 @@ class Ball:
         return np.asarray(0.5 * self.mass * v * v + potential)
 
 
-def sampled_ball(ball: Ball, law: Law) -> tuple[Array, Array, Array]:
+def bounced(
+    ball: Ball, law: str, deadbeat: bool = False, options: Mapping[str, float] | None = None
+) -> tuple[Array, Array, Array]:
+    """(y, ẏ, f) of `sampled_ball` for the law of that name, or of `continuous_ball`.
+
+    Raises UnknownLawError.
+    """
+    if law == CONTINUOUS:
+        return continuous_ball(ball)
+    return sampled_ball(ball, find_law(law, deadbeat), options or {})
+
+
+def write_ball(path: Path, ball: Ball, y: Array, v: Array, force: Array) -> None:
+    """CSV with columns t, y, v, f; all digits of a double. Raises InputError."""
+    table = np.column_stack([np.arange(len(y)) * ball.period, y, v, force])
+    try:
+        np.savetxt(path, table, fmt="%.17g", delimiter=",", header="t,y,v,f", comments="")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def sampled_ball(
+    ball: Ball, law: Law, options: Mapping[str, float] = MappingProxyType({})
+) -> tuple[Array, Array, Array]:
     """(y, ẏ, f) at the samples 0 … periods, each of shape (periods + 1,); the last f is 0.
 
-    f[j] is held from sample j to the next.
+    f[j] is held from sample j to the next. Raises UnknownLawError for an option that the law
+    does not have.
     """
     wall = np.zeros(1, WALL)
     set_plant(wall, ball.mass, ball.viscous, ball.spring, ball.period)
-    set_referent(wall, ball.stiffness, ball.damping, ball.options)
+    set_referent(wall, ball.stiffness, ball.damping, law.option_values(options))
     wall["tension"] = TENSION[ball.tension]
     wall["d"] = -ball.mass * ball.gravity
     trajectory = np.zeros((3, ball.periods + 1))
