@@ -1,0 +1,228 @@
+"""canopen's own master drives the simulated drive over python-can's virtual bus."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sized
+from functools import partial
+
+import can
+import canopen
+import pytest
+from canopen.profiles.p402 import BaseNode402
+from simdrive_bench import EDS, HEARTBEAT, NODE_ID, PERIOD_S, RecordingMotion
+
+from canwall.simdrive import BusRunner, Dictionary, SimulatedDrive
+
+WAIT_S = 10.0
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < end, "gave up waiting"
+        time.sleep(0.001)
+
+
+def has_length(items: Sized, count: int) -> bool:
+    return len(items) == count
+
+
+@pytest.fixture
+def motion() -> RecordingMotion:
+    return RecordingMotion()
+
+
+@pytest.fixture
+def node(request: pytest.FixtureRequest, motion: RecordingMotion) -> Iterator[BaseNode402]:
+    """A node on a network whose other end is the drive, served by a thread of the test."""
+    channel = request.node.name
+    network = canopen.Network()
+    network.NOTIFIER_CYCLE = 0.02  # seconds that disconnecting may take
+    network.connect(interface="virtual", channel=channel)
+    node = BaseNode402(NODE_ID, str(EDS))
+    network.add_node(node)
+    # A busy machine is no failure of the drive.
+    node.sdo.RESPONSE_TIMEOUT = node.TIMEOUT_CHECK_TPDO = WAIT_S
+    node.TIMEOUT_SWITCH_OP_MODE = node.TIMEOUT_SWITCH_STATE_FINAL = WAIT_S
+    node.TIMEOUT_SWITCH_STATE_SINGLE = WAIT_S
+    bus = can.Bus(interface="virtual", channel=channel)
+    drive = SimulatedDrive(Dictionary.load(EDS, NODE_ID), NODE_ID, motion, PERIOD_S)
+    runner = BusRunner(drive, bus)
+    stop = threading.Event()
+    thread = threading.Thread(target=runner.run, args=(stop.is_set,))
+    thread.start()
+    try:
+        wait_for(lambda: node.nmt.state == "PRE-OPERATIONAL")
+        yield node
+    finally:
+        stop.set()
+        thread.join()
+        network.disconnect()
+        bus.shutdown()
+
+
+def test_sdo(node: BaseNode402) -> None:
+    assert node.sdo["Device type"].raw == 0x00020192
+    assert node.sdo["Manufacturer device name"].raw == "canwall simulated servo drive"
+    assert node.sdo["Position encoder resolution"]["Encoder increments"].raw == 131072
+    assert node.sdo["Motor rated torque"].raw == 637
+    node.sdo["Max torque"].raw = 1234
+    assert node.sdo["Max torque"].raw == 1234
+    node.sdo.download(0x1014, 0, (0x80000085).to_bytes(4, "little"), force_segment=True)
+    assert node.sdo[0x1014].raw == 0x80000085
+    with pytest.raises(canopen.SdoAbortedError, match="06010002"):
+        node.sdo["Statusword"].raw = 0
+    with pytest.raises(canopen.SdoAbortedError, match="06090031"):
+        node.sdo["Max torque"].raw = 4000
+
+
+def test_heartbeat_and_reset(node: BaseNode402) -> None:
+    node.sdo["Producer heartbeat time"].raw = 5
+    node.nmt.wait_for_heartbeat(WAIT_S)
+    node.nmt.send_command(1)
+    node.nmt.wait_for_heartbeat(WAIT_S)
+    assert node.nmt.state == "OPERATIONAL"
+    node.sdo["Max torque"].raw = 1234
+    node.nmt.send_command(129)
+    wait_for(lambda: bool(node.nmt.state == "PRE-OPERATIONAL"))
+    assert node.sdo["Max torque"].raw == 3000
+    assert node.sdo["Producer heartbeat time"].raw == 0
+
+
+def test_emcy(node: BaseNode402) -> None:
+    node.nmt.send_command(1)
+    node.network.send_message(0x405, b"\x06")
+    wait_for(lambda: bool(node.emcy.active))
+    assert node.emcy.active[0].code == 0x8210
+    assert node.sdo[0x1003][1].raw & 0xFFFF == 0x8210
+
+
+def configure_cycle(node: BaseNode402) -> None:
+    """RPDO3 and TPDO3 with every SYNC, the statusword all 10 ms, nothing else."""
+    node.tpdo.read()
+    node.rpdo.read()
+    node.tpdo[1].event_timer = 10
+    node.tpdo[2].enabled = False
+    node.tpdo[3].clear()
+    for index in (0x6041, 0x6064, 0x6077):
+        node.tpdo[3].add_variable(index)
+    node.tpdo[3].trans_type = 1
+    node.rpdo[3].clear()
+    for index in (0x6040, 0x6071):
+        node.rpdo[3].add_variable(index)
+    node.rpdo[3].trans_type = 1
+    node.tpdo.save()
+    node.rpdo.save()
+
+
+def test_enable_and_torque(node: BaseNode402, motion: RecordingMotion) -> None:
+    configure_cycle(node)
+    node.setup_402_state_machine()
+    node.nmt.send_command(1)
+    node.op_mode = "CYCLIC SYNCHRONOUS TORQUE"
+    assert node.op_mode == "CYCLIC SYNCHRONOUS TORQUE"
+    node.state = "OPERATION ENABLED"
+    assert node.state == "OPERATION ENABLED"
+
+    received: list[tuple[int, ...]] = []
+    node.tpdo[3].add_callback(lambda pdo: received.append(tuple(variable.raw for variable in pdo)))
+    for count, torque in enumerate((100, -200, 5000), start=1):
+        node.rpdo[3]["Controlword"].raw = 0x0F
+        node.rpdo[3]["Target torque"].raw = torque
+        node.rpdo[3].transmit()
+        node.network.sync.transmit()
+        wait_for(partial(has_length, received, count))
+
+    assert received == [(0x1237, 1000, 100), (0x1237, 1007, -200), (0x1A37, 1014, 3000)]
+    advanced = [call[1] for call in motion.calls if call[0] == "advance"]
+    assert advanced == pytest.approx([0.0637, -0.1274, 1.911])
+    node.state = "SWITCH ON DISABLED"
+    assert node.sdo["Torque actual value"].raw == 0
+
+
+class Link:
+    """Two ends of a virtual bus in one thread, the drive on one of them."""
+
+    def __init__(self, channel: str) -> None:
+        self.motion = RecordingMotion()
+        self.master = can.Bus(interface="virtual", channel=channel)
+        self.bus = can.Bus(interface="virtual", channel=channel)
+        dictionary = Dictionary.load(EDS, NODE_ID)
+        drive = SimulatedDrive(dictionary, NODE_ID, self.motion, PERIOD_S)
+        self.runner = BusRunner(drive, self.bus)
+
+    def send(
+        self,
+        can_id: int,
+        data: bytes = b"",
+        *,
+        remote: bool = False,
+        extended: bool = False,
+        error: bool = False,
+    ) -> None:
+        self.master.send(
+            can.Message(
+                arbitration_id=can_id,
+                data=data,
+                is_extended_id=extended,
+                is_remote_frame=remote,
+                is_error_frame=error,
+            )
+        )
+
+    def answers(self) -> list[tuple[int, bytes]]:
+        frames = []
+        while (message := self.master.recv(0)) is not None:
+            assert not message.is_extended_id
+            frames.append((message.arbitration_id, bytes(message.data)))
+        return frames
+
+
+@pytest.fixture
+def link(request: pytest.FixtureRequest) -> Iterator[Link]:
+    link = Link(request.node.name)
+    yield link
+    link.master.shutdown()
+    link.bus.shutdown()
+
+
+def test_attaching_boots_the_drive(link: Link) -> None:
+    assert link.answers() == [(HEARTBEAT, b"\x00")]
+
+
+def test_poll_handles_all_that_waits_in_order(link: Link) -> None:
+    link.answers()
+    for torque in (1, 2, 3):
+        link.send(0x405, bytes([0, 0, torque, 0]))
+    link.send(0x000, b"\x01\x05")
+    for torque in (4, 5):
+        link.send(0x405, bytes([0, 0, torque, 0]))
+        link.send(0x605, b"\x40\x71\x60\x00\x00\x00\x00\x00")
+    link.runner.poll()
+    seen = [data[4] for can_id, data in link.answers() if can_id == 0x585]
+    assert seen == [4, 5]
+
+
+def test_remote_error_and_extended_frames_are_ignored(link: Link) -> None:
+    link.answers()
+    read = b"\x40\x00\x10\x00\x00\x00\x00\x00"
+    link.send(0x605, read, extended=True)
+    link.send(0x605, read, error=True)
+    link.send(0x080, remote=True)
+    link.runner.poll()
+    assert [frame for frame in link.answers() if frame[0] != 0x185] == []
+    assert [call for call in link.motion.calls if call[0] == "advance"] == []
+    link.send(0x605, read)
+    link.runner.poll()
+    assert len(link.answers()) == 1
+
+
+def test_poll_lets_the_timers_run(link: Link) -> None:
+    link.answers()
+    link.send(0x605, b"\x2b\x17\x10\x00\x01\x00\x00\x00")
+
+    def heart_beats() -> bool:
+        link.runner.poll()
+        return (HEARTBEAT, b"\x7f") in link.answers()
+
+    wait_for(heart_beats)

@@ -1,0 +1,166 @@
+"""PDO parameters: the order of CiA 301 (7.5.2.35 to 38) is accepted, everything else refused."""
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from canopen import SdoAbortedError
+from simdrive_bench import (
+    ACTUAL_TORQUE,
+    CONTROLWORD,
+    EDS,
+    NO_RTR,
+    NOT_VALID,
+    POSITION,
+    RPDO,
+    START,
+    STATUSWORD,
+    TARGET_TORQUE,
+    TPDO,
+    Bench,
+)
+
+DEVICE_STATE = "08000022"
+INVALID_VALUE = "06090030"
+NOT_MAPPABLE = "06040041"
+PDO_LENGTH = "06040042"
+NO_OBJECT = "06020000"
+NO_SUBINDEX = "06090011"
+TOO_HIGH = "06090031"
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 4])
+def test_order_of_cia_301(bench: Bench, number: int) -> None:
+    rpdo, tpdo = 0x1400 + number - 1, 0x1800 + number - 1
+    bench.configure_pdo(rpdo, RPDO[number], 1, [TARGET_TORQUE, CONTROLWORD])
+    bench.configure_pdo(tpdo, NO_RTR | TPDO[number], 1, [ACTUAL_TORQUE, POSITION, STATUSWORD])
+    assert bench.read(rpdo, 1) == RPDO[number]
+    assert bench.read(rpdo, 2) == 1
+    assert bench.read(tpdo, 1) == NO_RTR | TPDO[number]
+    assert [bench.read(tpdo + 0x200, n) for n in range(5)] == [
+        3,
+        ACTUAL_TORQUE,
+        POSITION,
+        STATUSWORD,
+        0,
+    ]
+    bench.nmt(START)
+    ((_, data),) = [frame for frame in bench.sync() if frame[0] == TPDO[number]]
+    assert data == struct.pack("<hiH", 0, bench.motion.position - bench.motion.step, 0x0250)
+
+
+def test_only_the_mapped_number_of_entries_is_sent(bench: Bench) -> None:
+    bench.configure_pdo(0x1803, NO_RTR | TPDO[4], 1, [STATUSWORD, POSITION])
+    bench.write(0x1803, 1, NOT_VALID | NO_RTR | TPDO[4], 4)
+    bench.write(0x1A03, 0, 1, 1)
+    bench.write(0x1803, 1, NO_RTR | TPDO[4], 4)
+    bench.nmt(START)
+    assert (TPDO[4], b"\x50\x02") in bench.sync()
+
+
+def write(index: int, subindex: int, value: int, size: int) -> Callable[[Bench], None]:
+    return lambda bench: bench.write(index, subindex, value, size)
+
+
+def invalid_pdo(*writes: Callable[[Bench], None]) -> Callable[[Bench], None]:
+    """Do the writes while RPDO1 and TPDO1 are invalid and have nothing mapped."""
+
+    def act(bench: Bench) -> None:
+        for communication, cob_id in ((0x1400, RPDO[1]), (0x1800, NO_RTR | TPDO[1])):
+            bench.write(communication, 1, NOT_VALID | cob_id, 4)
+            bench.write(communication + 0x200, 0, 0, 1)
+        for each in writes:
+            each(bench)
+
+    return act
+
+
+REFUSED: dict[str, tuple[str, Callable[[Bench], None]]] = {
+    "count of a valid PDO": (DEVICE_STATE, write(0x1600, 0, 0, 1)),
+    "mapping of a valid PDO": (DEVICE_STATE, write(0x1A00, 1, POSITION, 4)),
+    "mapping with a count": (DEVICE_STATE, write(0x1A03, 1, POSITION, 4)),
+    "CAN-ID of a valid PDO": (DEVICE_STATE, write(0x1800, 1, NO_RTR | 0x1A5, 4)),
+    "inhibit time of a valid PDO": (DEVICE_STATE, write(0x1800, 3, 10, 2)),
+    "valid with nothing mapped": (DEVICE_STATE, invalid_pdo(write(0x1400, 1, RPDO[1], 4))),
+    "TPDO that allows RTR": (INVALID_VALUE, write(0x1800, 1, TPDO[1], 4)),
+    "29-bit identifier": (INVALID_VALUE, write(0x1403, 1, 0x20000505, 4)),
+    "identifier of the SDO": (INVALID_VALUE, write(0x1403, 1, 0x605, 4)),
+    "identifier of NMT": (INVALID_VALUE, write(0x1403, 1, 0x000, 4)),
+    "transmission type 241": (INVALID_VALUE, write(0x1800, 2, 241, 1)),
+    "transmission type 253": (INVALID_VALUE, write(0x1800, 2, 253, 1)),
+    "object that is not there": (NO_OBJECT, invalid_pdo(write(0x1A00, 1, 0x60990010, 4))),
+    "sub-index that is not there": (NO_SUBINDEX, invalid_pdo(write(0x1A00, 1, 0x60410110, 4))),
+    "object not for PDOs": (NOT_MAPPABLE, invalid_pdo(write(0x1A00, 1, 0x10000020, 4))),
+    "status into an RPDO": (NOT_MAPPABLE, invalid_pdo(write(0x1600, 1, STATUSWORD, 4))),
+    "control into a TPDO": (NOT_MAPPABLE, invalid_pdo(write(0x1A00, 1, CONTROLWORD, 4))),
+    "wrong length": (NOT_MAPPABLE, invalid_pdo(write(0x1A00, 1, 0x60640010, 4))),
+    "dummy into a TPDO": (NO_OBJECT, invalid_pdo(write(0x1A00, 1, 0x00050008, 4))),
+    "dummy of wrong length": (NOT_MAPPABLE, invalid_pdo(write(0x1600, 1, 0x00050010, 4))),
+    "bit as dummy": (NO_OBJECT, invalid_pdo(write(0x1600, 1, 0x00010001, 4))),
+    "empty entry counted": (
+        NO_OBJECT,
+        invalid_pdo(write(0x1A00, 1, 0, 4), write(0x1A00, 0, 1, 1)),
+    ),
+    "more than 64 bits": (
+        PDO_LENGTH,
+        invalid_pdo(
+            write(0x1A00, 1, POSITION, 4),
+            write(0x1A00, 2, POSITION, 4),
+            write(0x1A00, 3, STATUSWORD, 4),
+            write(0x1A00, 0, 3, 1),
+        ),
+    ),
+    "nine objects": (TOO_HIGH, invalid_pdo(write(0x1A00, 0, 9, 1))),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_refused(bench: Bench, name: str) -> None:
+    code, act = REFUSED[name]
+    with pytest.raises(SdoAbortedError, match=code):
+        act(bench)
+
+
+def test_refused_write_leaves_the_pdo_as_it_is(bench: Bench) -> None:
+    with pytest.raises(SdoAbortedError):
+        bench.write(0x1A00, 1, POSITION, 4)
+    assert bench.nmt(START)[0] == (TPDO[1], b"\x00\x00")
+
+
+def test_mapping_of_the_eds_is_checked_when_the_pdo_becomes_valid(tmp_path: Path) -> None:
+    path = tmp_path / "edited.eds"
+    path.write_text(EDS.read_text().replace("DefaultValue=0x60770010", "DefaultValue=0x60990010"))
+    bench = Bench(path)
+    with pytest.raises(SdoAbortedError, match=NO_OBJECT):
+        bench.write(0x1803, 1, NO_RTR | TPDO[4], 4)
+    assert bench.read(0x1803, 1) & NOT_VALID
+
+
+def test_identifier_may_change_with_the_write_that_invalidates(bench: Bench) -> None:
+    bench.write(0x1402, 1, NOT_VALID | 0x1A5, 4)
+    bench.write(0x1402, 1, 0x1A5, 4)
+    assert bench.read(0x1402, 1) == 0x1A5
+
+
+def test_transmission_type_and_event_timer_change_while_valid(bench: Bench) -> None:
+    bench.nmt(START)
+    bench.write(0x1800, 2, 1, 1)
+    bench.write(0x1800, 5, 10, 2)
+    assert TPDO[1] in [can_id for can_id, _ in bench.sync()]
+
+
+def test_dummies_skip_bytes_of_an_rpdo(bench: Bench) -> None:
+    bench.configure_pdo(0x1403, RPDO[4], 255, [0x00050008, TARGET_TORQUE, 0x00070020])
+    bench.nmt(START)
+    bench.give(RPDO[4], b"\xff\x34\x12\xff\xff\xff\xff")
+    assert bench.read(0x6071) == 0x1234
+
+
+def test_two_rpdos_may_listen_to_one_identifier(bench: Bench) -> None:
+    bench.configure_pdo(0x1402, 0x1F0, 255, [CONTROLWORD])
+    bench.configure_pdo(0x1403, 0x1F0, 255, [TARGET_TORQUE])
+    bench.nmt(START)
+    bench.give(0x1F0, b"\x06\x00")
+    assert bench.read(0x6040) == 6
+    assert bench.read(0x6071) == 6
