@@ -76,6 +76,7 @@ class Mechanics(_Section):
     inertia_kg_m2: Positive
     viscous_nm_s_per_rad: NonNegative = 0.0
     coulomb_nm: NonNegative = 0.0
+    spring_nm_per_rad: NonNegative = 0.0
     handle_radius_m: Positive | None = None
 
 
@@ -95,9 +96,9 @@ class Wall(_Section):
 
 
 class Estimator(_Section):
-    """`[estimator]`: how fast the Kalman filter follows the operator's force."""
+    """`[estimator]`: how fast the operator's force may change, for the Kalman filter."""
 
-    bandwidth_hz: Positive = 150.0
+    force_walk_nm_per_sqrt_s: Positive = 0.2
 
 
 class Limits(_Section):
@@ -133,6 +134,7 @@ class Hand(_Section):
     interval_s: Positive = 1.0
     rest_rad: Number = 0.1
     press_rad: Number = -0.1
+    press_torque_nm: Number = 0.0
     approach_s: Positive = 0.1
     press_s: NonNegative = 0.5
     withdraw_s: Positive = 0.1

@@ -240,18 +240,17 @@ def referent_positions(settings: Settings, signals: Any) -> Array | None:
     damping = signals["damping"].to_numpy()
     wall_position = signals["wall_position_rad"].to_numpy()
     side = 1.0 if settings.wall.side == "below" else -1.0
-    path = simdrive.hand_path(simulation.hand, period, count)
+    constant, slope = simdrive.hand_force(simulation.hand, period, count)
     plant = make_plant(**simdrive.hand_plant(simulation))
-    constant, slope = simdrive.hand_force(simulation, side * path, period)
-    y, v = side * path[0] - side * wall_position[0], 0.0
+    y, v = side * (simulation.hand.rest_rad - wall_position[0]), 0.0
     positions = np.empty(count)
     for j in range(count):
         positions[j] = y
         origin = side * wall_position[j]
         plant["wall_stiffness"], plant["wall_damping"] = stiffness[j], damping[j]
         # The hand's spring is measured from the wall as well.
-        pull = constant[j] - simulation.hand.stiffness_nm_per_rad * origin
-        y, v, _ = advance(plant[0], y, v, pull, slope[j], period)
+        pull = side * constant[j] - simulation.hand.stiffness_nm_per_rad * origin
+        y, v, _ = advance(plant[0], y, v, pull, side * slope[j], period)
         if j + 1 < count:
             y += origin - side * wall_position[j + 1]
     return positions

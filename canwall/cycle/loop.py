@@ -31,7 +31,7 @@ from canwall.walls import Law
 #: Cycles within which a drive has to reach OPERATION ENABLED, and to leave it.
 _ENABLE_CYCLES = 2000
 _LEAVE_CYCLES = 500
-#: Cycles without a TPDO after which a drive is taken for gone while leaving.
+#: Cycles without a TPDO after which a drive is taken for gone while enabling and leaving.
 _SILENT_CYCLES = 50
 #: States in which a drive gives no torque until it is enabled anew.
 _DISABLED = (State.SWITCH_ON_DISABLED, State.FAULT)
@@ -151,6 +151,8 @@ class _Loop:
             self._record["controlword"] = controlword_up(state, previous)
             if state is State.OPERATION_ENABLED:
                 return
+            if self._silent():
+                raise _WallGivenUpError(f"no TPDO for {_SILENT_CYCLES} cycles while enabling")
             self._exchange.cycle()
         raise _WallGivenUpError(f"the drive stays in {self._state()}{self._emergency()}")
 
@@ -198,7 +200,7 @@ class _Loop:
             record["controlword"] = controlword_down(state)
             if state in _DISABLED and self._exchange.row["phase"][0] == Phase.LEAVING:
                 return True
-            if record["missed_in_a_row"] > _SILENT_CYCLES:
+            if self._silent():
                 return False
             self._exchange.cycle()
         return False
@@ -208,6 +210,9 @@ class _Loop:
         self._node.write(od.TARGET_TORQUE, 0, 0)
         self._node.write(od.CONTROLWORD, 0, Controlword.DISABLE_VOLTAGE)
         return state_of(self._node.read(od.STATUSWORD)) in _DISABLED
+
+    def _silent(self) -> bool:
+        return bool(self._record["missed_in_a_row"] >= _SILENT_CYCLES)
 
     def _state(self) -> str:
         statusword = int(self._record["statusword"])

@@ -137,7 +137,8 @@ def make_cycle(settings: Settings, setup: DriveSetup, laws: Sequence[Law]) -> ND
     cycle["ramp_cycles"] = limits.ramp_cycles
     for i, law in enumerate(laws):
         cycle["laws"][0, i] = law.address
-    mass, viscous, spring = mechanics.inertia_kg_m2, mechanics.viscous_nm_s_per_rad, 0.0
+    mass, viscous = mechanics.inertia_kg_m2, mechanics.viscous_nm_s_per_rad
+    spring = mechanics.spring_nm_per_rad
     set_plant(cycle["wall"][0], mass, viscous, spring, period)
     try:
         set_estimator(
@@ -148,7 +149,7 @@ def make_cycle(settings: Settings, setup: DriveSetup, laws: Sequence[Law]) -> ND
             mechanics.coulomb_nm,
             period,
             count=units.rad_per_count,
-            bandwidth_hz=settings.estimator.bandwidth_hz,
+            force_walk=settings.estimator.force_walk_nm_per_sqrt_s,
             delay=SYNCHRONOUS_DELAY,
         )
     except ValueError as error:
@@ -282,7 +283,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     cycle.y_before = oriented
     y, wall.v = actuation_state(estimator)
     wall.y = y - origin
-    wall.d = estimator.d
+    wall.d = estimator.d - wall.spring * origin
 
     force = 0.0
     if cycle.phase == _RENDERING:

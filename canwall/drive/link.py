@@ -5,7 +5,9 @@ Here whoever waits for a frame reads the bus, and hands what is not his to the n
 transfers and the cycle need no lock and no second thread.
 """
 
+import contextlib
 import logging
+import struct
 import time
 from collections.abc import Callable
 
@@ -17,9 +19,12 @@ from canopen.sdo.exceptions import SdoCommunicationError
 # What fails is raised; canopen logs it as well, which without a handler goes to stderr.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
 
-#: Server command specifiers of an SDO's first answer, to a download and to an upload: it repeats
-#: index and subindex of the request (CiA 301, 7.2.4.3).
-_INITIATE_RESPONSES = (2, 3)
+#: What an SDO server answers to what, by command specifier: download segment, initiate download,
+#: initiate upload, upload segment; and the abort (CiA 301, 7.2.4.3).
+_ANSWERS = {0: 1, 1: 3, 2: 2, 3: 0}
+_ABORT = 4
+#: Requests whose answer repeats index and subindex.
+_INITIATE = (1, 2)
 
 #: Takes note of a frame: time [s], message, whether it was received (else sent).
 FrameLog = Callable[[float, can.Message, bool], None]
@@ -79,8 +84,11 @@ class Link:
             remaining = max(0.0, deadline - time.monotonic())
 
     def dispatch(self, message: can.Message) -> None:
-        """Hand a frame to canopen (SDO answers, heartbeats, EMCY)."""
-        if not (message.is_remote_frame or message.is_error_frame):
+        """Hand a frame to canopen (SDO answers, heartbeats, EMCY); malformed ones are ignored."""
+        if message.is_remote_frame or message.is_error_frame:
+            return
+        # Somebody's heartbeat without data, or EMCY too short, is not to end the cycle.
+        with contextlib.suppress(struct.error):
             self.network.notify(message.arbitration_id, message.data, message.timestamp)
 
     def serve(self, timeout_s: float) -> bool:
@@ -138,18 +146,23 @@ class _Sdo(SdoClient):  # type: ignore[misc]
     def __init__(self, rx: int, tx: int, dictionary: canopen.ObjectDictionary, link: Link) -> None:
         super().__init__(rx, tx, dictionary)
         self._link = link
-        self._requested = b""
+        self._request = bytes(8)
 
     def send_request(self, request: bytearray) -> None:
-        self._requested = bytes(request[1:4])
+        self._request = bytes(request)
         super().send_request(request)
 
     def on_response(self, can_id: int, data: bytearray, timestamp: float) -> None:
-        # What comes too late for the request before, or for another master, answers nothing; nor
-        # does what is no SDO (which always has 8 bytes).
-        first = len(data) == 8 and data[0] >> 5 in _INITIATE_RESPONSES
-        if len(data) == 8 and (not first or data[1:4] == self._requested):
+        # What comes too late for the request before, or for another master, answers nothing.
+        if len(data) == 8 and self._answers(data):
             super().on_response(can_id, data, timestamp)
+
+    def _answers(self, data: bytearray) -> bool:
+        specifier, asked = data[0] >> 5, self._request[0] >> 5
+        if specifier == _ABORT:
+            return True
+        same = asked not in _INITIATE or data[1:4] == self._request[1:4]
+        return specifier == _ANSWERS.get(asked) and same
 
     def read_response(self) -> bytes:
         deadline = time.monotonic() + self.RESPONSE_TIMEOUT

@@ -5,8 +5,8 @@ from canwall.simdrive.build import make_drive
 from canwall.simdrive.dictionary import Dictionary, DictionaryError
 from canwall.simdrive.drive import SimulatedDrive
 from canwall.simdrive.frame import Frame
-from canwall.simdrive.hand import hand_path
-from canwall.simdrive.motion import ServoMotion, hand_force, hand_plant
+from canwall.simdrive.hand import hand_force
+from canwall.simdrive.motion import ServoMotion, hand_plant
 from canwall.simdrive.runner import BusRunner
 
 __all__ = [
@@ -18,7 +18,6 @@ __all__ = [
     "ServoMotion",
     "SimulatedDrive",
     "hand_force",
-    "hand_path",
     "hand_plant",
     "make_drive",
 ]

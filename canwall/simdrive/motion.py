@@ -2,12 +2,9 @@
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
 from canwall.config import Simulation
 from canwall.physics import advance, make_plant
-from canwall.simdrive.hand import hand_path
+from canwall.simdrive.hand import hand_force
 
 
 def hand_plant(simulation: Simulation) -> dict[str, float]:
@@ -19,20 +16,6 @@ def hand_plant(simulation: Simulation) -> dict[str, float]:
         "spring": hand.stiffness_nm_per_rad,
         "coulomb": simulation.coulomb_nm,
     }
-
-
-def hand_force(
-    simulation: Simulation, path: NDArray[np.float64], period_s: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Force of a hand whose position moves along `path`, (u₀, u₁) of u₀ + u₁·t in each period.
-
-    path has shape (n + 1,) [rad]; u₀ [N·m] and u₁ [N·m/s] have shape (n,). The part that depends
-    on the handle's own position and velocity is in the plant.
-    """
-    hand = simulation.hand
-    speed = np.diff(path) / period_s
-    spring, damper = hand.stiffness_nm_per_rad, hand.damping_nm_s_per_rad
-    return spring * path[:-1] + damper * speed, spring * speed
 
 
 class ServoMotion:
@@ -50,13 +33,12 @@ class ServoMotion:
         self._counts_per_rad = counts_per_rev / (2.0 * math.pi)
         self._plant = make_plant(**hand_plant(simulation))[0]
         self._elapsed = 0
-        self.position_rad = float(hand_path(simulation.hand, period_s, 0)[0])
+        self.position_rad = simulation.hand.rest_rad
         self.speed_rad_s = 0.0
         self._lay_out(self._PIECE)
 
     def _lay_out(self, periods: int) -> None:
-        path = hand_path(self._simulation.hand, self._period_s, periods)
-        constant, slope = hand_force(self._simulation, path, self._period_s)
+        constant, slope = hand_force(self._simulation.hand, self._period_s, periods)
         self._constant, self._slope = constant.tolist(), slope.tolist()
 
     def counts(self) -> int:

@@ -42,34 +42,28 @@ ESTIMATOR = np.dtype(
 
 
 def kalman_gain(
-    mass: float, viscous: float, spring: float, period: float, count: float, bandwidth_hz: float
+    mass: float, viscous: float, spring: float, period: float, count: float, force_walk: float
 ) -> NDArray[np.float64]:
     """Steady-state gain on [y, ẏ, d] for a position quantised in steps of `count`; shape (3,).
 
-    Measurement noise R = count²/12. The bias force is a random walk, as strong as makes the
-    continuous filter of a pure mass have its (Butterworth) poles at `bandwidth_hz`:
-    q = m²·R·T·ω⁶ per second. Raises ValueError where the filter would be faster than a fifth of
-    the sampling rate.
+    Measurement noise R = count²/12. The bias force is a random walk of force_walk [N·m/√s]. For a
+    pure mass the continuous filter then has Butterworth poles at ω = (q²/(m²·R·T))^(1/6): one
+    setting follows a light handle faster than a heavy one, as their noise allows.
     """
-    if bandwidth_hz * period > 0.2:
-        raise ValueError(
-            f"a bandwidth of {bandwidth_hz:g} Hz is too much for a cycle of {period:g} s; "
-            f"keep it below {0.2 / period:g} Hz"
-        )
     phi, gamma = zoh(mass, viscous, spring, period)
     a = np.eye(3)
     a[:2, :2] = phi
     a[:2, 2] = gamma
     c = np.array([[1.0, 0.0, 0.0]])
-    omega = 2.0 * math.pi * bandwidth_hz
-    # In units of the count, of the velocity and of the force that go with it at this bandwidth the
-    # covariances are of one order, and the Riccati solver keeps its digits.
-    scale = np.array([1.0, omega, mass * omega * omega])
+    # In units of the count, and of the velocity and the force that go with it at the filter's
+    # bandwidth, the covariances are of one order, and the Riccati solver keeps its digits.
+    omega = (12.0 * force_walk**2 / (mass * mass * count * count * period)) ** (1.0 / 6.0)
+    scale = np.array([count, count * omega, count * mass * omega * omega])
     a = a * scale[None, :] / scale[:, None]
-    noise = np.diag([0.0, 0.0, period * period * omega * omega / 12.0])
+    noise = np.diag([0.0, 0.0, period * (force_walk / scale[2]) ** 2])
     prior = solve_discrete_are(a.T, c.T, noise, np.array([[1.0 / 12.0]]))
     gain = prior @ c.T / (c @ prior @ c.T + 1.0 / 12.0)
-    return np.asarray(gain[:, 0] * scale)
+    return np.asarray(gain[:, 0] * scale / count)
 
 
 def set_estimator(
@@ -80,12 +74,12 @@ def set_estimator(
     coulomb: float,
     period: float,
     count: float,
-    bandwidth_hz: float,
+    force_walk: float,
     delay: float,
 ) -> None:
     """Write model, gain and delay D (in periods, 0 ≤ D ≤ MAX_DELAY) into an ESTIMATOR array (1,).
 
-    Raises ValueError for a delay or a bandwidth out of range.
+    count and force_walk are those of `kalman_gain`. Raises ValueError for a delay out of range.
     """
     if not 0.0 <= delay <= MAX_DELAY:
         raise ValueError(f"a delay of {delay:g} periods is not between 0 and {MAX_DELAY}")
@@ -94,7 +88,7 @@ def set_estimator(
     estimator["delay_periods"] = whole
     estimator["mass"] = mass
     estimator["coulomb"] = coulomb
-    estimator["gain"] = kalman_gain(mass, viscous, spring, period, count, bandwidth_hz)
+    estimator["gain"] = kalman_gain(mass, viscous, spring, period, count, force_walk)
     for name, share in (("full", 1.0), ("before", fraction), ("after", 1.0 - fraction)):
         phi, gamma = zoh(mass, viscous, spring, share * period)
         estimator[name]["duration"] = share * period
