@@ -15,8 +15,9 @@ from canwall.record import RunFolder, read_signals
 Array = NDArray[np.float64]
 
 #: Colours that stay apart for colour-blind readers (Okabe and Ito, 2008).
-_COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442", "#000000")
-_STYLE: Any = {
+COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442", "#000000")
+#: What all figures of the project look like: rcParams for `matplotlib.rc_context`.
+STYLE: Any = {
     "font.size": 9,
     "axes.titlesize": 10,
     "axes.titlelocation": "left",
@@ -40,14 +41,14 @@ def plot_run(folder: RunFolder) -> Path:
     signals, summary = read_signals(folder.signals), folder.read_summary()
     strikes = summary["strikes"]
     laws = list(dict.fromkeys(strike["law"] for strike in strikes))
-    colours = dict(zip(laws, _COLOURS * 4, strict=False))
+    colours = dict(zip(laws, COLOURS * 4, strict=False))
     shown = [next(s for s in strikes if s["law"] == law) for law in laws[:2]]
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(12, 9), layout="constrained", dpi=120)
         rows = figure.add_gridspec(3, 1, height_ratios=[1.1, 0.9, 1.5])
         over_time = figure.add_subplot(rows[0])
         torque = figure.add_subplot(rows[1], sharex=over_time)
-        _position(over_time, signals, strikes, colours)
+        draw_strikes(over_time, signals, strikes, colours)
         _torque(torque, signals, strikes, colours)
         details = rows[2].subgridspec(1, max(len(shown), 1) + 1)
         for column, strike in enumerate(shown):
@@ -68,9 +69,13 @@ def _mark_strikes(axes: Axes, strikes: list[dict[str, Any]], colours: dict[str, 
         )
 
 
-def _position(
+def draw_strikes(
     axes: Axes, signals: pa.Table, strikes: list[dict[str, Any]], colours: dict[str, str]
 ) -> None:
+    """Position [mrad] over time, each strike of the summary with its law and whether it chatters.
+
+    colours maps each law to its colour.
+    """
     t, y = _column(signals, "t_s"), _column(signals, "y") * 1e3
     axes.plot(t, y, color="0.2", lw=0.7)
     axes.axhline(0.0, color="k", lw=0.8)

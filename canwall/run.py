@@ -5,7 +5,7 @@ Prepare everything that can fail on bad input, then touch the bus, then the driv
 
 import json
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +17,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from canwall import simdrive
+from canwall.compiled import Record, compiled
 from canwall.config import ConfigError, Settings
 from canwall.cycle import (
     MAX_LAWS,
@@ -32,7 +33,7 @@ from canwall.eds import load_eds
 from canwall.errors import RunFailedError
 from canwall.physics import advance, make_plant
 from canwall.plots import plot_run
-from canwall.record import Recorder, RecordError, RunFolder, read_signals
+from canwall.record import Recorder, RecordError, Ring, RunFolder, read_signals
 from canwall.summary import summarise
 from canwall.walls import Law, UnknownLawError, find_law
 
@@ -99,6 +100,53 @@ def serve_drive(settings: Settings, stop: Callable[[], bool]) -> None:
 
 
 @dataclass(frozen=True)
+class Bench:
+    """A drive that is set up, and the cycle that will render the wall on it."""
+
+    node: DriveNode
+    setup: DriveSetup
+    cycle: NDArray[np.void]
+    exchange: PythonCanExchange
+
+
+def set_up_bench(link: Link, settings: Settings, laws: Sequence[Law], ring: Ring) -> Bench:
+    """Set the drive up for its wall, the rows of its cycles going into the ring.
+
+    Nothing is enabled yet. Raises DictionaryError, DriveError.
+    """
+    dictionary = load_eds(settings.drive.eds, settings.drive.node_id, REQUIRED_OBJECTS)
+    node = DriveNode(link, settings.drive.node_id, dictionary)
+    setup = set_up(node, settings.drive)
+    cycle = make_cycle(settings, setup, laws)
+    exchange = PythonCanExchange(link, setup, cycle, ring, settings.real_time)
+    return Bench(node, setup, cycle, exchange)
+
+
+def render(
+    bench: Bench,
+    settings: Settings,
+    laws: Sequence[Law],
+    stop: Callable[[], bool],
+    progress: Callable[[float], None] = lambda now_s: None,
+) -> Outcome:
+    """Enable the drive, render the wall for `[run] duration_s` or until stopped, disable it.
+
+    progress is told the seconds of bus time about every 100 ms of them.
+    """
+    period, end_s = settings.bus.cycle_s, settings.run.duration_s
+    return run_loop(
+        bench.exchange,
+        bench.cycle,
+        bench.node,
+        laws,
+        [Change(round(at_s / period), wall) for at_s, wall in settings.walls[1:]],
+        None if end_s is None else round(end_s / period),
+        stop,
+        lambda j: progress(j * period),
+    )
+
+
+@dataclass(frozen=True)
 class RunResult:
     """What a run came to."""
 
@@ -116,53 +164,46 @@ def run(
 ) -> RunResult:
     """Enable the drive, render the wall, record, summarise, draw (`canwall run`).
 
-    report is told the steps before and after the loop, progress the seconds of bus time done and
-    their end. Raises ConfigError and DictionaryError before anything is enabled, DriveError where
-    the drive cannot be set up, RunFailedError where no cycle came about or none was recorded.
+    report is told the steps, progress the seconds of bus time done and their end. Raises
+    ConfigError and DictionaryError before anything is enabled, DriveError where the drive cannot
+    be set up, RunFailedError where no cycle came about or none was recorded.
     """
     laws = run_laws(settings)
-    dictionary = load_eds(settings.drive.eds, settings.drive.node_id, REQUIRED_OBJECTS)
-    simulated = make_simulated_drive(settings) if settings.embedded else None
-    with _on_the_bus(settings, simulated) as link:
+    load_eds(settings.drive.eds, settings.drive.node_id, REQUIRED_OBJECTS)
+    with on_the_bus(settings) as link:
         folder = RunFolder.create(output)
         folder.config.write_text(settings.to_toml(), encoding="utf-8")
-        recorder = Recorder(
-            folder.path, settings.run.bus_log, settings.bus.channel, [law.name for law in laws]
-        )
+        names = [law.name for law in laws]
+        recorder = Recorder(folder.path, settings.run.bus_log, settings.bus.channel, names)
         try:
             link.log = recorder.ring.log_frame
             report("setting up the drive")
-            node = DriveNode(link, settings.drive.node_id, dictionary)
-            setup = set_up(node, settings.drive)
-            cycle = make_cycle(settings, setup, laws)
-            exchange = PythonCanExchange(link, setup, cycle, recorder.ring, settings.real_time)
-            end_s = settings.run.duration_s
+            bench = set_up_bench(link, settings, laws, recorder.ring)
             report("rendering")
             with stop_on_signals() as stop:
-                outcome = run_loop(
-                    exchange,
-                    cycle,
-                    node,
+                outcome = render(
+                    bench,
+                    settings,
                     laws,
-                    _changes(settings),
-                    None if end_s is None else round(end_s / settings.bus.cycle_s),
                     stop,
-                    lambda j: progress(j * settings.bus.cycle_s, end_s),
+                    lambda now_s: progress(now_s, settings.run.duration_s),
                 )
         finally:
             notes = recorder.close()
     report("summarising")
     signals = _recorded(folder, [*outcome.trips, *notes])
-    summary = summarise(signals, settings, setup.units, referent_positions(settings, signals))
+    asked_for = (signals[name].to_numpy() for name in ("stiffness", "damping", "wall_position_rad"))
+    referent = referent_positions(settings, *asked_for)
+    summary = summarise(signals, settings, bench.setup.units, referent)
     summary |= {
-        "missed_tpdo": int(cycle["missed_tpdo"][0]),
-        "late_rpdo": exchange.late_rpdo,
+        "missed_tpdo": int(bench.cycle["missed_tpdo"][0]),
+        "late_rpdo": bench.exchange.late_rpdo,
         "trips": outcome.trips,
         "interrupted": outcome.interrupted,
-        "drive": _described(setup),
+        "drive": _described(bench.setup),
         "timing": {
-            "sync_interval": timing_summary(exchange.sync_interval),
-            "tpdo_to_rpdo": timing_summary(exchange.latency),
+            "sync_interval": timing_summary(bench.exchange.sync_interval),
+            "tpdo_to_rpdo": timing_summary(bench.exchange.latency),
         },
     }
     folder.summary.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
@@ -200,21 +241,19 @@ def run_laws(settings: Settings) -> list[Law]:
     return list(laws.values())
 
 
-def _changes(settings: Settings) -> list[Change]:
-    period = settings.bus.cycle_s
-    return [Change(round(at_s / period), wall) for at_s, wall in settings.walls[1:]]
-
-
 @contextmanager
-def _on_the_bus(settings: Settings, simulated: simdrive.SimulatedDrive | None) -> Iterator[Link]:
-    """A link to the bus; an embedded drive lives on the same bus, in the master's idle time."""
-    if simulated is None:
+def on_the_bus(settings: Settings) -> Iterator[Link]:
+    """A link to the bus; an embedded drive lives on the same bus, in the master's idle time.
+
+    Raises ConfigError and DictionaryError.
+    """
+    if not settings.embedded:
         with open_bus(settings) as bus:
             yield Link(bus)
-    else:
-        with open_bus(settings) as bus, open_bus(settings) as drive_bus:
-            runner = simdrive.BusRunner(simulated, drive_bus)
-            yield Link(bus, idle=runner.poll)
+        return
+    drive = make_simulated_drive(settings)
+    with open_bus(settings) as bus, open_bus(settings) as drive_bus:
+        yield Link(bus, idle=simdrive.BusRunner(drive, drive_bus).poll)
 
 
 def _described(setup: DriveSetup) -> dict[str, float]:
@@ -226,31 +265,46 @@ def _described(setup: DriveSetup) -> dict[str, float]:
     }
 
 
-def referent_positions(settings: Settings, signals: Any) -> Array | None:
-    """Positions relative to the wall, at each SYNC of the record, of the continuous referent.
+def referent_positions(
+    settings: Settings, stiffness: Array, damping: Array, wall_position: Array
+) -> Array | None:
+    """Positions relative to the wall, at each SYNC of a run, of the continuous referent; (n,).
 
     The referent is the same hand with the same script on the same handle, against the continuous
-    wall that each cycle asks for; shape (n,). None where the hand is a person's.
+    wall that each cycle asked for: stiffness [N·m/rad], damping [N·m·s/rad] and position [rad],
+    each of shape (n,). None where the hand is a person's.
     """
     if settings.simulation is None:
         return None
     simulation, period = settings.simulation, settings.bus.cycle_s
-    count = signals.num_rows
-    stiffness = signals["stiffness"].to_numpy()
-    damping = signals["damping"].to_numpy()
-    wall_position = signals["wall_position_rad"].to_numpy()
     side = 1.0 if settings.wall.side == "below" else -1.0
-    constant, slope = simdrive.hand_force(simulation.hand, period, count)
+    origin = side * wall_position
+    constant, slope = simdrive.hand_force(simulation.hand, period, len(stiffness))
+    # Measured from the wall, the hand's spring pulls from another place.
+    pull = side * constant - simulation.hand.stiffness_nm_per_rad * origin
+    y = np.empty(len(stiffness))
+    y[0] = side * simulation.hand.rest_rad - origin[0]
     plant = make_plant(**simdrive.hand_plant(simulation))
-    y, v = side * (simulation.hand.rest_rad - wall_position[0]), 0.0
-    positions = np.empty(count)
-    for j in range(count):
-        positions[j] = y
-        origin = side * wall_position[j]
-        plant["wall_stiffness"], plant["wall_damping"] = stiffness[j], damping[j]
-        # The hand's spring is measured from the wall as well.
-        pull = side * constant[j] - simulation.hand.stiffness_nm_per_rad * origin
-        y, v, _ = advance(plant[0], y, v, pull, side * slope[j], period)
-        if j + 1 < count:
-            y += origin - side * wall_position[j + 1]
-    return positions
+    _follow(plant, stiffness, damping, origin, pull, side * slope, period, y)
+    return y
+
+
+@compiled
+def _follow(
+    plants: NDArray[np.void],
+    stiffness: Array,
+    damping: Array,
+    origin: Array,
+    constant: Array,
+    slope: Array,
+    period: float,
+    y: Array,
+) -> None:
+    """Fill y from its first value on, starting at rest."""
+    plant: Record = plants[0]
+    v = 0.0
+    for j in range(len(y) - 1):
+        plant.wall_stiffness = stiffness[j]
+        plant.wall_damping = damping[j]
+        y_next, v, _ = advance(plant, y[j], v, constant[j], slope[j], period)
+        y[j + 1] = y_next + origin[j] - origin[j + 1]

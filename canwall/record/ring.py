@@ -117,6 +117,10 @@ class Ring:
         """Bytes of shared memory."""
         return cls._offsets()[2]
 
+    def close(self) -> None:
+        """Let go of the descriptor; the memory goes with its last user."""
+        os.close(self.descriptor)
+
     def log_frame(self, time_s: float, message: can.Message, received: bool) -> None:
         """Note a frame (a `drive.FrameLog`)."""
         flags = (
