@@ -85,9 +85,12 @@ def amplitude_tolerance(stiffness: float, count: float, force_step: float) -> fl
     return max(6.0 * count, 3.0 * force_step / stiffness if stiffness > 0.0 else 0.0)
 
 
-def chatter(y: Array, referent: Array | None, cycle_s: float, tolerance: float) -> Chatter:
+def chatter(
+    y: Array, referent: Array | None, cycle_s: float, tolerance: float, count: float
+) -> Chatter:
     """Judge one strike: y and the continuous referent's positions over its cycles, shape (n,).
 
+    count is one encoder count, tolerance `amplitude_tolerance` [both as y].
     Chatter is motion about the settled contact by more than `tolerance` beyond the referent's
     own, or EVENTS_OF_CHATTER makes and breaks within EVENT_WINDOW_S that the referent does not
     make. Without a referent (a person at the handle) only the events can be judged.
@@ -95,8 +98,8 @@ def chatter(y: Array, referent: Array | None, cycle_s: float, tolerance: float) 
     window = max(1, round(EVENT_WINDOW_S / cycle_s))
     # A wall that loses some energy bounces as its referent does, only earlier: it is the busiest
     # window of each that is compared, not window by window.
-    events = int(_events(y, window).max(initial=0))
-    expected = 0 if referent is None else int(_events(referent, window).max(initial=0))
+    events = _events(y, window, count)
+    expected = 0 if referent is None else _events(referent, window, count)
     if events - expected >= EVENTS_OF_CHATTER:
         compared = "without a referent" if referent is None else f"the referent {expected}"
         return Chatter(
@@ -117,12 +120,19 @@ def chatter(y: Array, referent: Array | None, cycle_s: float, tolerance: float) 
     return Chatter(measured - own > tolerance, f"{compared}, quantisation explains {tolerance:.3g}")
 
 
-def _events(y: Array, window: int) -> NDArray[np.int64]:
-    """Makes and breaks of contact within each window of cycles."""
-    events = np.abs(np.diff((y < 0.0).astype(np.int64)))
-    if len(events) <= window:
-        return np.array([events.sum()])
-    return np.asarray(sliding_window_view(events, window).sum(axis=1))
+def _events(y: Array, window: int, count: float) -> int:
+    """The most makes and breaks of contact within any window of cycles.
+
+    Contact is made below 0 and broken above one count: to and fro between two counts at the
+    surface, as the last bit of a resting encoder may go, is neither.
+    """
+    side = np.where(y < 0.0, -1, np.where(y > count, 1, 0))
+    decided = np.flatnonzero(side)
+    changes = np.zeros(len(y), np.int64)
+    changes[decided[1:]] = side[decided[1:]] != side[decided[:-1]]
+    if len(changes) <= window:
+        return int(changes.sum())
+    return int(sliding_window_view(changes, window).sum(axis=1).max())
 
 
 def settled_stretch(referent: Array, tolerance: float) -> slice:

@@ -75,7 +75,11 @@ def _strike(
         float(stiffness[start]), units.rad_per_count, units.nm_per_mille
     )
     verdict = metrics.chatter(
-        inside, None if referent is None else referent[cycles], period, tolerance
+        inside,
+        None if referent is None else referent[cycles],
+        period,
+        tolerance,
+        units.rad_per_count,
     )
     amplitude, frequency = metrics.limit_cycle(inside, period) if verdict.chatters else (0.0, 0.0)
     running = work[cycles] - work[start]

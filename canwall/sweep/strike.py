@@ -151,7 +151,7 @@ def judge(
     tolerance = metrics.amplitude_tolerance(
         settings.wall.stiffness_nm_per_rad, units.rad_per_count, units.nm_per_mille
     )
-    verdict = metrics.chatter(y, referent, settings.bus.cycle_s, tolerance)
+    verdict = metrics.chatter(y, referent, settings.bus.cycle_s, tolerance, units.rad_per_count)
     return Verdict(
         chatters=verdict.chatters or bool(trips),
         reason="; ".join(trips) or verdict.reason,

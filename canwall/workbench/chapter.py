@@ -86,11 +86,12 @@ class Traces:
             "-f/K [m]": -self.force / BALL.stiffness,
         }
 
-    def draw(self, axes: Axes, rendered: str, samples: bool) -> None:
+    def draw(self, axes: Axes, samples: bool) -> None:
         """Referent dashed, rendered motion solid, force as stairs; where wanted its samples."""
         axes.axhline(0.0, color="k", lw=0.8)
+        axes.plot(self.t, self.y, color=RENDERED, lw=1.6, label="sampled-data floor")
+        # Dashed over solid: where the two agree, both are to be seen.
         axes.plot(self.t, self.referent, color=REFERENT, lw=1.1, ls="--", label="continuous floor")
-        axes.plot(self.t, self.y, color=RENDERED, lw=1.4, label=rendered)
         if samples:
             at = self.at_sample == 1
             axes.plot(self.t[at], self.y[at], "o", color=RENDERED, ms=3.5, label="samples")
@@ -109,7 +110,7 @@ def _short(
     """A few bounces beside the referent's, the close-up's part of them boxed."""
     traces = Traces.of(bounces)
     figure, axes = blank(title, _TIME, _POSITION)
-    traces.draw(axes, "sampled-data floor", samples=False)
+    traces.draw(axes, samples=False)
     if box is not None:
         part = Traces.of(bounces, box)
         low, high = part.y.min(), max(part.y.max(), part.referent.max())
@@ -127,7 +128,7 @@ def _close_up(
     """One contact, the samples marked; a force that pulls filled out."""
     traces = Traces.of(bounces, _around(contact))
     figure, axes = blank(title, _TIME, _POSITION)
-    traces.draw(axes, "sampled-data floor", samples=True)
+    traces.draw(axes, samples=True)
     if (pull := -traces.force).max() > 0.0:
         axes.fill_between(
             traces.t,
@@ -157,19 +158,26 @@ def tracing_out() -> Iterator[Sheet]:
     contact = bounces.contacts[0]
     traces = Traces.of(bounces, slice(contact.start - 1, contact.stop - 1))
     depth = -traces.y
+    deepest = float(depth.max())
     title = "Figure 5.3: tracing out the virtual wall"
     figure, axes = blank(title, "penetration x = −y [m]", "force f out of the wall [N]", (7.0, 5.4))
-    axes.fill(depth, traces.force, color=FORCE, alpha=0.15, lw=0.0, label="energy put out")
-    axes.plot(depth, traces.force, color=FORCE, lw=1.3, label="held force")
-    line = np.array([0.0, depth.max()])
+    # Held over each interval: along x at constant force, then the step to the next.
+    x, force = np.repeat(depth, 2)[1:], np.repeat(traces.force, 2)[:-1]
+    axes.fill(x, force, color=FORCE, alpha=0.15, lw=0.0, label="energy put out")
+    axes.plot(x, force, color=FORCE, lw=1.3, label="held force")
+    line = np.array([0.0, deepest])
     axes.plot(line, BALL.stiffness * line, color=REFERENT, ls="--", lw=1.1, label="f = K·x")
-    deepest = float(depth.max())
-    for at, to, text in ((0.62, 0.3, "moving in"), (0.25, 0.55, "moving out")):
+    for text, tail, head in (
+        ("moving in", (0.55, 0.22), (0.75, 0.42)),
+        ("moving out", (0.42, 0.75), (0.22, 0.55)),
+    ):
         axes.annotate(
             text,
-            (at * deepest, to * deepest * BALL.stiffness),
+            (head[0] * deepest, head[1] * deepest * BALL.stiffness),
+            (tail[0] * deepest, tail[1] * deepest * BALL.stiffness),
             ha="center",
             color="0.2",
+            arrowprops={"arrowstyle": "->", "color": "0.2"},
         )
     legend_below(figure, axes)
     put_in, given_back = work_in_and_out(bounces, contact)
@@ -354,7 +362,9 @@ def long_term(seconds: float, drops: int) -> Iterator[Sheet]:
     title = "Figure 5.12: half-sample prediction, long-term"
     figure, axes = blank(title, _TIME, "height y [m]", (11.0, 4.6))
     axes.axhline(0.0, color="k", lw=0.8)
-    axes.plot(t, y, color=RENDERED, lw=0.5, label="sampled-data floor")
+    axes.plot(t, y, color=RENDERED, lw=0.4, alpha=0.7, label="sampled-data floor")
+    top = 1 + np.flatnonzero((y[1:-1] > 0.0) & (y[1:-1] > y[:-2]) & (y[1:-1] >= y[2:]))
+    axes.plot(t[top], y[top], "o", color=RENDERED, ms=4.0, label="height of a bounce")
     axes.axhline(BALL.height, color=REFERENT, ls="--", lw=1.3, label="continuous floor's height")
     axes.margins(x=0.01)
     legend_below(figure, axes)
@@ -371,7 +381,7 @@ def long_term(seconds: float, drops: int) -> Iterator[Sheet]:
         f"and {heights.max() / BALL.height:.1%} of the target; ln E changes by "
         f"{bounces.gains.mean():+.4f} a bounce, standard deviation {bounces.gains.std():.4f}. Of "
         f"{drops} drops from 11 to 13 m {both} come out more than 1 % above their height as well "
-        "as more than 1 % below it in this time, the others on one side alone.",
+        "as more than 1 % below it in this time.",
         {"t [s]": t, "y rendered [m]": y, "y target [m]": np.full(len(t), BALL.height)},
         figure,
     )

@@ -64,7 +64,7 @@ def blank(title: str, x: str, y: str, size: tuple[float, float] = (9.0, 4.6)) ->
 def legend_below(figure: Figure, axes: Axes) -> None:
     """The legend where no data can be."""
     handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4)
+    figure.legend(handles, labels, loc="outside lower center", ncols=5)
 
 
 def stairs(axes: Axes, t: Array, level: Array, label: str, **style: Any) -> None:
