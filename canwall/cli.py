@@ -176,8 +176,21 @@ def _named_numbers(given: list[str]) -> dict[str, float]:
     return numbers
 
 
+@app.command()
+def figures(
+    output: Annotated[Path, typer.Option(help="Folder for pictures, data and index.md.")],
+) -> int:
+    """The chapter's figures, drawn anew, each beside its data; and all laws compared."""
+    from canwall.workbench.figures import write_figures
+
+    with _RunProgress() as shown:
+        index = write_figures(output, progress=shown.count)
+    _console.print(str(index), soft_wrap=True, highlight=False)
+    return 0
+
+
 class _RunProgress:
-    """Progress of a run: what is being done, then seconds of bus time."""
+    """Progress: what is being done, then seconds of bus time, or steps."""
 
     def __init__(self) -> None:
         self._progress = Progress(
@@ -205,6 +218,12 @@ class _RunProgress:
     def advance(self, now_s: float, end_s: float | None) -> None:
         clock = f"{now_s:.1f} s" if end_s is None else f"{now_s:.1f} of {end_s:g} s"
         self._progress.update(self._task, completed=now_s, total=end_s, clock=clock)
+
+    def count(self, what: str, done: int, total: int) -> None:
+        clock = f"{done} of {total}"
+        self._progress.update(
+            self._task, description=what, completed=done, total=total, clock=clock
+        )
 
 
 def _strike_table(strikes: list[dict[str, Any]]) -> Table:

@@ -10,17 +10,22 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from canwall.config import ConfigError
+from canwall.record.ring import ROW
 
 
 def read_signals(path: Path) -> pa.Table:
     """signals.parquet as a table. Raises ConfigError where it is missing or not readable."""
     try:
-        return pq.read_table(path)
+        table = pq.read_table(path)
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; give the folder of a run") from None
     except (OSError, pa.ArrowInvalid) as error:
         reason = str(error).splitlines()[0]
         raise ConfigError(f"{path}: not a record of a run: {reason}") from None
+    missing = [name for name in ROW.names or () if name not in table.column_names]
+    if missing:
+        raise ConfigError(f"{path}: not a record of a run: lacks column {', '.join(missing)}")
+    return table
 
 
 @dataclass(frozen=True)
@@ -77,4 +82,6 @@ class RunFolder:
             content: dict[str, Any] = json.loads(self.summary.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise ConfigError(f"{self.summary}: not a summary of a run: {error}") from None
+        if "strikes" not in content:
+            raise ConfigError(f"{self.summary}: not a summary of a run: lacks strikes")
         return content

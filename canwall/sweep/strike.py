@@ -64,7 +64,8 @@ def strike_settings(
 
     speed_rad_s is the mean speed of the hand's approach; phase, 0 … 1, shifts the start by that
     share of the way of one period, and with it the instant of contact against the SYNC.
-    known_inertia is what the laws' model has of the inertia that is really there.
+    The model of the laws has drive and hand but for the hand's spring: about a hand that moves, it
+    is for the estimated force. known_inertia is the share of the inertia that the model knows.
     """
     simulation = base.simulation or Simulation()
     start = _START_RAD + phase * speed_rad_s * base.bus.cycle_s
@@ -90,7 +91,6 @@ def strike_settings(
         inertia_kg_m2=(simulation.inertia_kg_m2 + operator.inertia_kg_m2) * known_inertia,
         viscous_nm_s_per_rad=simulation.viscous_nm_s_per_rad + operator.damping_nm_s_per_rad,
         coulomb_nm=simulation.coulomb_nm,
-        spring_nm_per_rad=stiffness,
     )
     duration = _FIRST_STRIKE_S + 2.0 * travel_s + _PRESS_S + _AFTERWARDS_S
     return base.model_copy(

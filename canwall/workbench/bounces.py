@@ -35,7 +35,7 @@ class Bounces:
     @property
     def t(self) -> Array:
         """Times of the samples."""
-        return np.arange(len(self.y)) * self.ball.period
+        return np.arange(len(self.y), dtype=np.float64) * self.ball.period
 
     @cached_property
     def contacts(self) -> list[slice]:
@@ -67,7 +67,7 @@ class Bounces:
         for i in range(points):
             phi, gamma = zoh(ball.mass, ball.viscous, ball.spring, ball.period * i / points)
             y[:, i] = phi[0, 0] * self.y[:-1] + phi[0, 1] * self.v[:-1] + gamma[0] * u
-        t = np.arange(y.size + 1) * (ball.period / points)
+        t = np.arange(y.size + 1, dtype=np.float64) * (ball.period / points)
         return t, np.append(y.ravel(), self.y[-1])
 
     def passing(self, j: int, level: float = 0.0) -> float:

@@ -1,7 +1,8 @@
 """A figure with its data and with what is to be said of it: on disk a PNG, a CSV, and a text."""
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from canwall.errors import InputError
 from canwall.plots import COLOURS
 
 Array = NDArray[np.float64]
@@ -18,6 +20,15 @@ Array = NDArray[np.float64]
 # One colour for one thing, in every figure.
 FORCE, RENDERED, ACCENT = COLOURS[0], COLOURS[1], COLOURS[2]
 REFERENT = "0.25"
+
+
+@contextmanager
+def writing(folder: Path) -> Iterator[None]:
+    """What cannot be written there is an InputError."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
 
 
 @dataclass(frozen=True)
@@ -35,12 +46,14 @@ class Sheet:
     figure: Figure
 
     def write(self, folder: Path) -> None:
-        """PNG and CSV into the folder; all digits of a double. Raises OSError."""
-        self.figure.savefig(folder / f"{self.name}.png")
-        with (folder / f"{self.name}.csv").open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(self.columns)
-            writer.writerows(zip(*(c.tolist() for c in self.columns.values()), strict=True))
+        """PNG and CSV into the folder; all digits of a double. Raises InputError."""
+        rows = zip(*(column.tolist() for column in self.columns.values()), strict=True)
+        with writing(folder):
+            self.figure.savefig(folder / f"{self.name}.png")
+            with (folder / f"{self.name}.csv").open("w", encoding="utf-8", newline="") as file:
+                writer = csv.writer(file, lineterminator="\n")
+                writer.writerow(self.columns)
+                writer.writerows(rows)
 
     def text(self) -> str:
         """Its section of the index, in Markdown."""
