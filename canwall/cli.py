@@ -90,14 +90,16 @@ def drive(config_file: _ConfigArgument = None) -> int:
         )
     from canwall.run import serve_drive, stop_on_signals
 
-    with stop_on_signals() as stop:
+    def joined() -> None:
         _console.print(
             f"simulated drive, node {settings.drive.node_id}, "
             f"on {settings.bus.interface} {settings.bus.channel}; Ctrl-C ends it",
             soft_wrap=True,
             highlight=False,
         )
-        serve_drive(settings, stop)
+
+    with stop_on_signals() as stop:
+        serve_drive(settings, stop, joined)
     return 0
 
 

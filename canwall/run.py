@@ -82,21 +82,23 @@ def open_bus(settings: Settings) -> can.BusABC:
 def make_simulated_drive(settings: Settings) -> simdrive.SimulatedDrive:
     """The drive of `[simulation]`, from the dictionary of `[drive]`.
 
-    Raises ConfigError.
+    Raises ConfigError, DictionaryError.
     """
     if settings.simulation is None:
         raise ConfigError("[simulation] is missing: there is no drive to simulate")
-    try:
-        return simdrive.make_drive(settings.drive, settings.simulation, settings.bus.cycle_s)
-    except simdrive.DictionaryError as error:
-        raise ConfigError(f"drive.eds: {error}") from None
+    return simdrive.make_drive(settings.drive, settings.simulation, settings.bus.cycle_s)
 
 
-def serve_drive(settings: Settings, stop: Callable[[], bool]) -> None:
-    """A simulated drive alone on its bus, until stopped (`canwall drive`)."""
+def serve_drive(settings: Settings, stop: Callable[[], bool], joined: Callable[[], None]) -> None:
+    """A simulated drive alone on its bus, until stopped (`canwall drive`).
+
+    `joined` is called when it hears what is on the bus.
+    """
     drive = make_simulated_drive(settings)
     with open_bus(settings) as bus:
-        simdrive.BusRunner(drive, bus).run(stop)
+        runner = simdrive.BusRunner(drive, bus)
+        joined()
+        runner.run(stop)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """The exchange of one cycle's frames over python-can, for any adapter that it supports."""
 
 import time
+from typing import Any
 
 import can
 import numpy as np
@@ -23,6 +24,25 @@ _SYNCHRONOUS_WINDOW = 0.8
 _BACKLOG = 0.5
 #: A writer that takes nothing for this long is taken for gone; what is lost is counted.
 _WRITER_PATIENCE_S = 10.0
+
+
+class _CyclicFrame(can.Message):
+    """A frame that is sent in every cycle, with other data.
+
+    python-can's virtual bus copies each frame deeply, which by the general way of copy.deepcopy
+    takes as long as all the rest of a cycle.
+    """
+
+    def __init__(self, can_id: int, length: int) -> None:
+        super().__init__(arbitration_id=can_id, is_extended_id=False, data=bytes(length))
+
+    def __deepcopy__(self, memo: dict[int, Any] | None) -> can.Message:
+        return can.Message(
+            timestamp=self.timestamp,
+            arbitration_id=self.arbitration_id,
+            is_extended_id=False,
+            data=bytes(self.data),
+        )
 
 
 class PythonCanExchange:
@@ -50,12 +70,8 @@ class PythonCanExchange:
         self._tpdo_id = setup.tpdo.cob_id
         self._tpdo_length = setup.tpdo.length
         self._rpdo_length = setup.rpdo.length
-        self._sync = can.Message(arbitration_id=setup.sync_cob_id, is_extended_id=False)
-        self._rpdo = can.Message(
-            arbitration_id=setup.rpdo.cob_id,
-            is_extended_id=False,
-            data=bytes(setup.rpdo.length),
-        )
+        self._sync = _CyclicFrame(setup.sync_cob_id, 0)
+        self._rpdo = _CyclicFrame(setup.rpdo.cob_id, setup.rpdo.length)
         self.row = np.zeros(1, ROW)
         self.sync_interval = np.zeros(1, HISTOGRAM)
         self.latency = np.zeros(1, HISTOGRAM)

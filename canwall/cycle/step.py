@@ -153,7 +153,7 @@ def make_cycle(settings: Settings, setup: DriveSetup, laws: Sequence[Law]) -> ND
             delay=SYNCHRONOUS_DELAY,
         )
     except ValueError as error:
-        raise ConfigError(f"estimator.bandwidth_hz: {error}") from None
+        raise ConfigError(f"estimator.force_walk_nm_per_sqrt_s: {error}") from None
     set_wall(cycle, settings.wall, laws)
     return cycle
 

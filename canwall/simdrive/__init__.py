@@ -2,7 +2,7 @@
 
 from canwall.simdrive.axis import Motion
 from canwall.simdrive.build import make_drive
-from canwall.simdrive.dictionary import Dictionary, DictionaryError
+from canwall.simdrive.dictionary import Dictionary
 from canwall.simdrive.drive import SimulatedDrive
 from canwall.simdrive.frame import Frame
 from canwall.simdrive.hand import hand_force
@@ -12,7 +12,6 @@ from canwall.simdrive.runner import BusRunner
 __all__ = [
     "BusRunner",
     "Dictionary",
-    "DictionaryError",
     "Frame",
     "Motion",
     "ServoMotion",

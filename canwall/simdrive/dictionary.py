@@ -1,7 +1,6 @@
 """The object dictionary (CiA 301, 7.4): a flat table of typed entries, from an EDS or DCF."""
 
 from collections.abc import Callable, Container, Iterator
-from configparser import Error as ConfigParserError
 from pathlib import Path
 from struct import Struct
 from typing import Any, TypeAlias
@@ -9,6 +8,7 @@ from typing import Any, TypeAlias
 import canopen
 from canopen.objectdictionary import ODVariable, datatypes
 
+from canwall.eds import DictionaryError, load_eds
 from canwall.simdrive.abort import AbortCode, AccessError
 
 MANDATORY = {
@@ -30,10 +30,6 @@ Key: TypeAlias = tuple[int, int]
 
 _FIRST_OBJECT = 0x1000
 _COMMUNICATION_PROFILE = range(0x1000, 0x2000)
-
-
-class DictionaryError(ValueError):
-    """An EDS or DCF that no drive can be built from; one line, naming file and object."""
 
 
 class Entry:
@@ -209,15 +205,7 @@ class Dictionary:
         """
         if not 1 <= node_id <= 127:
             raise ValueError(f"node-ID {node_id} is not in 1 to 127")
-        try:
-            # canopen opens paths in the encoding of the locale; vendors write any.
-            with open(path, encoding="utf-8", errors="replace") as file:
-                od = canopen.import_od(file, node_id)
-        except OSError as error:
-            raise DictionaryError(f"{path}: {error.strerror}") from error
-        except (ConfigParserError, LookupError, ValueError) as error:
-            reason = " ".join(str(error).split())
-            raise DictionaryError(f"{path}: not an EDS: {reason}") from error
+        od = load_eds(Path(path), node_id)
         return cls(str(path), node_id, _variables(od))
 
     def __contains__(self, key: Key) -> bool:

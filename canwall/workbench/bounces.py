@@ -39,7 +39,10 @@ class Bounces:
 
     @cached_property
     def contacts(self) -> list[slice]:
-        """The contacts that ended, as slices of samples (`metrics.contacts`)."""
+        """The contacts that ended, as slices of samples (`metrics.contacts`).
+
+        At the last sample the force is not known, so neither is whether one ends there.
+        """
         found = metrics.contacts(self.y, self.force)
         return [c for c in found if self.y[c.stop - 1] >= 0.0 and c.stop < len(self.y)]
 

@@ -18,7 +18,7 @@ from canwall.plots import COLOURS
 Array = NDArray[np.float64]
 
 # One colour for one thing, in every figure.
-FORCE, RENDERED, ACCENT = COLOURS[0], COLOURS[1], COLOURS[2]
+FORCE, RENDERED, SAMPLES, ACCENT = COLOURS[0], COLOURS[5], COLOURS[1], COLOURS[2]
 REFERENT = "0.25"
 
 

@@ -7,7 +7,8 @@ import canopen
 import pytest
 from simdrive_bench import EDS, NODE_ID, PERIOD_S, Bench, RecordingMotion
 
-from canwall.simdrive import Dictionary, DictionaryError, SimulatedDrive
+from canwall.eds import DictionaryError
+from canwall.simdrive import Dictionary, SimulatedDrive
 
 
 def sections() -> RawConfigParser:
@@ -88,9 +89,9 @@ def edited(directory: Path, old: str, new: str) -> Path:
             "[1017]\nParameterName=Producer heartbeat time\nObjectType=0x7\nDataType=0x0009",
             "object 0x1017:00 not an integer",
         ),
-        ("ParameterName=Device type\n", "", "not an EDS: No option"),
-        ("[1018]", "[1018", "not an EDS"),
-        ("[FileInfo]", "", "not an EDS: File contains no section headers"),
+        ("ParameterName=Device type\n", "", "not a readable EDS or DCF: No option"),
+        ("[1018]", "[1018", "not a readable EDS or DCF"),
+        ("[FileInfo]", "", "not a readable EDS or DCF: File contains no section headers"),
     ],
 )
 def test_bad_file(tmp_path: Path, old: str, new: str, reason: str) -> None:
@@ -104,7 +105,7 @@ def test_bad_file(tmp_path: Path, old: str, new: str, reason: str) -> None:
 
 def test_missing_file(tmp_path: Path) -> None:
     path = tmp_path / "none.eds"
-    with pytest.raises(DictionaryError, match="No such file or directory"):
+    with pytest.raises(DictionaryError, match="no such EDS"):
         Dictionary.load(path, NODE_ID)
 
 

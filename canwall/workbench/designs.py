@@ -1,0 +1,225 @@
+"""Figures 5.8 to 5.17 of the source: the standard floor, and the controllers that replace it."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
+
+from canwall.workbench.ball import CONTINUOUS
+from canwall.workbench.bounces import Bounces
+from canwall.workbench.sheet import FORCE, REFERENT, SAMPLES, Sheet, blank, legend_below
+from canwall.workbench.traces import BALL, POINTS, POSITION, TIME, Traces, around, fall
+
+Array = NDArray[np.float64]
+
+#: From where the balls fall that tell how typical Figure 5.12 is [m].
+DROPS = (11.0, 13.0)
+
+
+def _short(
+    name: str, title: str, bounces: Bounces, box: slice | None, claim: str, finding: str
+) -> Sheet:
+    """A few bounces beside the referent's, the close-up's part of them boxed."""
+    traces = Traces.of(bounces)
+    figure, axes = blank(title, TIME, POSITION)
+    traces.draw(axes, samples=False)
+    if box is not None:
+        part = Traces.of(bounces, box)
+        low, high = part.y.min(), max(part.y.max(), part.referent.max())
+        span = part.t[-1] - part.t[0]
+        axes.add_patch(
+            Rectangle((part.t[0], low - 0.7), span, high - low + 1.4, fill=False, lw=0.9)
+        )
+    legend_below(figure, axes)
+    return Sheet(name, title, claim, finding, traces.columns(), figure)
+
+
+def _close_up(
+    name: str, title: str, bounces: Bounces, contact: slice, claim: str, finding: str
+) -> Sheet:
+    """One contact, the samples marked; a force that pulls filled out."""
+    traces = Traces.of(bounces, around(contact))
+    figure, axes = blank(title, TIME, POSITION)
+    traces.draw(axes, samples=True)
+    if (pull := -traces.force).max() > 0.0:
+        axes.fill_between(
+            traces.t,
+            0.0,
+            pull / BALL.stiffness,
+            where=(pull > 0.0).tolist(),
+            step="post",
+            color=FORCE,
+            alpha=0.35,
+            lw=0.0,
+            label="the floor pulls",
+        )
+    legend_below(figure, axes)
+    return Sheet(name, title, claim, finding, traces.columns(), figure)
+
+
+def sampled_data() -> Iterator[Sheet]:
+    """Figures 5.8 and 5.9."""
+    bounces = fall("standard")
+    contact = bounces.contacts[0]
+    heights = ", ".join(f"{h:.2f}" for h in bounces.heights)
+    kept = float(np.abs(fall(CONTINUOUS).heights - BALL.height).max())
+    yield _short(
+        "figure_5_08",
+        "Figure 5.8: sampled-data ball on the standard floor",
+        bounces,
+        around(contact),
+        "The ball bounces higher and higher; the continuous ball keeps its height.",
+        f"Heights of {heights} m: ln E grows by {bounces.gains.mean():.3f} a bounce. "
+        f"The continuous ball keeps its {BALL.height:g} m to {kept:.0e} m.",
+    )
+    leaving = bounces.v[contact.stop - 1]
+    traces = Traces.of(bounces, around(contact))
+    yield _close_up(
+        "figure_5_09",
+        "Figure 5.9: sampled-data ball on the standard floor, close-up",
+        bounces,
+        contact,
+        "The floor's behaviour is non-physical: as in Figure 5.3 the held force is too small on "
+        "the way in and too large on the way out.",
+        f"The ball came in at {np.sqrt(2.0 * BALL.gravity * BALL.height):.2f} m/s and passes the "
+        f"first sample outside at {leaving:.2f} m/s. It dives to {traces.y.min():.2f} m (the "
+        f"continuous ball to {traces.referent.min():.2f} m), and at the end of the close-up is "
+        f"{traces.y[-1] - traces.referent[-1]:.2f} m above the continuous ball.",
+    )
+
+
+def meetings(bounces: Bounces, contact: slice) -> Array:
+    """Where in its period each force of a contact meets the position that it stands for; 0 … 1.
+
+    Left out are the periods within which they do not meet once: about the turning point, and
+    where the ball leaves.
+    """
+    found = [
+        bounces.passing(j, -bounces.force[j] / bounces.ball.stiffness)
+        for j in range(contact.start, contact.stop - 2)
+    ]
+    return np.array([t / bounces.ball.period for t in found if np.isfinite(t)])
+
+
+def strongest_pull(bounces: Bounces) -> slice:
+    """The contact in which the floor pulls most."""
+    return min(bounces.contacts, key=lambda c: float(bounces.force[c].min()))
+
+
+def half_sample() -> Iterator[Sheet]:
+    """Figures 5.10 and 5.11."""
+    bounces, standard = fall("half_sample"), fall("standard")
+    contact = strongest_pull(bounces)
+    off = np.abs(bounces.heights[1:] / BALL.height - 1.0)
+    yield _short(
+        "figure_5_10",
+        "Figure 5.10: half-sample prediction",
+        bounces,
+        around(contact),
+        "Vastly improved over the standard floor, but deviations from the desired path can "
+        "already be seen.",
+        f"After {len(bounces.contacts)} bounces the height is {bounces.heights[-1]:.2f} m "
+        f"(standard floor, after {len(standard.contacts)}: {standard.heights[-1]:.2f} m); it is "
+        f"off the {BALL.height:g} m by up to {off.max():.1%}.",
+    )
+    met = meetings(bounces, contact)
+    last = contact.stop - 2
+    pull = -bounces.force[last]
+    taken = pull * (bounces.y[last + 1] - bounces.y[last])
+    yield _close_up(
+        "figure_5_11",
+        "Figure 5.11: half-sample prediction, close-up",
+        bounces,
+        contact,
+        "The stairs of the held force meet the position about midway between the samples; in the "
+        "last period of the contact the floor pulls, and the ball does work on it.",
+        f"They meet at {met.mean():.3f} of the period ({met.min():.3f} to {met.max():.3f}, "
+        f"{len(met)} periods). In the last one the floor pulls with {pull:.3f} N and takes "
+        f"{taken:.3f} J.",
+    )
+
+
+def long_term(seconds: float, drops: int) -> Iterator[Sheet]:
+    """Figure 5.12 over that time; how typical it is from this many heights of drop."""
+    bounces = fall("half_sample", seconds)
+    t, y = bounces.between(POINTS)
+    title = "Figure 5.12: half-sample prediction, long-term"
+    figure, axes = blank(title, TIME, "height y [m]", (11.0, 4.6))
+    axes.axhline(0.0, color="k", lw=0.8)
+    axes.plot(t, y, color=SAMPLES, lw=0.4, alpha=0.7, label="sampled-data floor")
+    top = 1 + np.flatnonzero((y[1:-1] > 0.0) & (y[1:-1] > y[:-2]) & (y[1:-1] >= y[2:]))
+    axes.plot(t[top], y[top], "o", color=SAMPLES, ms=4.0, label="height of a bounce")
+    axes.axhline(BALL.height, color=REFERENT, ls="--", lw=1.3, label="continuous floor's height")
+    axes.margins(x=0.01)
+    legend_below(figure, axes)
+    heights = bounces.heights[1:]
+    both = sum(
+        h.min() < 0.99 * h[0] and h.max() > 1.01 * h[0]
+        for h in (fall("half_sample", seconds, s).heights for s in np.linspace(*DROPS, drops))
+    )
+    yield Sheet(
+        "figure_5_12",
+        title,
+        "The height of the bounces is irregular, sometimes above the target, sometimes below it.",
+        f"Over {len(heights)} bounces the height lies between {heights.min() / BALL.height:.1%} "
+        f"and {heights.max() / BALL.height:.1%} of the target; ln E changes by "
+        f"{bounces.gains.mean():+.4f} a bounce, standard deviation {bounces.gains.std():.4f}. Of "
+        f"{drops} drops from {DROPS[0]:g} to {DROPS[1]:g} m {both} come out "
+        "more than 1% above their height as well as more than 1% below it in this time.",
+        {"t [s]": t, "y rendered [m]": y, "y target [m]": np.full(len(t), BALL.height)},
+        figure,
+    )
+
+
+def digital_design() -> Iterator[Sheet]:
+    """Figure 5.14."""
+    bounces, other = fall("pole_placement"), fall("half_sample")
+    count = min(len(bounces.heights), len(other.heights))
+    apart = np.abs(bounces.heights[:count] / other.heights[:count] - 1.0)
+    off = np.abs(bounces.heights[1:] / BALL.height - 1.0)
+    yield _short(
+        "figure_5_14",
+        "Figure 5.14: controller designed in the digital domain (pole placement)",
+        bounces,
+        None,
+        "Essentially the response of the half-sample prediction; still not perfect, because of "
+        "the switching at the threshold.",
+        f"The heights differ from the half-sample prediction's by up to {apart.max():.1%}, and "
+        f"from the target by up to {off.max():.1%}.",
+    )
+
+
+def with_deadbeat() -> Iterator[Sheet]:
+    """Figures 5.16 and 5.17."""
+    bounces = fall("half_sample+deadbeat")
+    contact = strongest_pull(bounces)
+    error = np.abs(bounces.heights / BALL.height - 1.0).max()
+    traces = Traces.of(bounces)
+    outside = (traces.at_sample == 1) & (traces.y >= 0.0) & (traces.force == 0.0)
+    apart = np.abs(traces.y - traces.referent)
+    yield _short(
+        "figure_5_16",
+        "Figure 5.16: full control algorithm (half-sample prediction with deadbeat)",
+        bounces,
+        around(contact),
+        "The result is indistinguishable from the continuous target.",
+        f"Every bounce regains its height to {error:.0e}; at the samples outside the ball is "
+        f"within {apart[outside].max():.0e} m of the continuous one, inside within "
+        f"{apart[traces.y < 0.0].max():.3f} m.",
+    )
+    last = contact.stop - 2
+    forces = bounces.force[last - 1 : last + 1]
+    part = Traces.of(bounces, around(contact))
+    inside = np.abs(part.y - part.referent).max()
+    yield _close_up(
+        "figure_5_17",
+        "Figure 5.17: full control algorithm, close-up",
+        bounces,
+        contact,
+        "The last two forces of the contact drive the ball to the state that the continuous floor "
+        "would give it at the first sample outside.",
+        f"Those two are {forces[0]:.3f} N and {forces[1]:.3f} N. Within the contact the two "
+        f"balls are up to {inside:.3f} m apart; at the first sample outside "
+        f"{abs(part.y[-1] - part.referent[-1]):.0e} m.",
+    )

@@ -1,0 +1,214 @@
+"""Figures 5.18 and 5.19 of the source: four strikes on the simulated drive, through the bus."""
+
+import math
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.optimize import brentq
+
+from canwall import config, metrics
+from canwall.compiled import Record, compiled
+from canwall.config import Settings, Wall
+from canwall.cycle import make_cycle, set_wall
+from canwall.drive import DriveSetup, PdoLayout
+from canwall.errors import RunFailedError
+from canwall.plots import COLOURS, draw_strikes
+from canwall.record import read_signals
+from canwall.run import run, run_laws
+from canwall.units import DriveUnits, to_per_mille
+from canwall.walls import find_law, note_force, wall_force
+from canwall.workbench.sheet import REFERENT, Sheet, blank, legend_below, stairs
+
+Array = NDArray[np.float64]
+
+#: Contacts of the first strike that the close-up shows, by number, and samples around them.
+_SHOWN = slice(1, 3)
+_AROUND = 2
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A run as it was recorded."""
+
+    settings: Settings
+    signals: pa.Table
+    summary: dict[str, Any]
+
+    def column(self, name: str) -> Array:
+        """A column of the record, shape (cycles,)."""
+        return np.asarray(self.signals[name].to_numpy(), dtype=np.float64)
+
+
+def recorded_run() -> Recorded:
+    """The run of config/sim.toml. Raises RunFailedError where it did not run to its end."""
+    settings = config.load(config.shipped("config/sim.toml"))
+    with tempfile.TemporaryDirectory() as scratch:
+        result = run(settings, Path(scratch) / "run")
+        if result.outcome.interrupted:
+            raise KeyboardInterrupt
+        if troubles := [*result.outcome.trips, *result.notes]:
+            raise RunFailedError("; ".join(troubles))
+        return Recorded(settings, read_signals(result.folder.signals), result.summary)
+
+
+def four_strikes() -> Iterator[Sheet]:
+    """Both figures, from one run."""
+    recorded = recorded_run()
+    yield _strikes(recorded)
+    yield _efforts(recorded)
+
+
+def close_up(recorded: Recorded) -> slice:
+    """The cycles of the close-up: the second and third contact of the first strike."""
+    strike = recorded.summary["strikes"][0]
+    start, end = (round(strike[k] / recorded.settings.bus.cycle_s) for k in ("start_s", "end_s"))
+    y, force = recorded.column("y")[start:end], recorded.column("force_applied")[start:end]
+    shown = metrics.contacts(y, force)[_SHOWN]
+    return slice(start + shown[0].start - _AROUND, start + shown[-1].stop + _AROUND)
+
+
+def effort(recorded: Recorded, wall: Wall) -> Array:
+    """Force that this wall, whatever was displayed, would hold from each SYNC on [N·m].
+
+    What its law makes of the sample and of the state that the estimator found in each cycle, in
+    steps of the drive's torque and within its limit, in force one SYNC later (theory, section 3);
+    shape (cycles,). `wall` is one of the run's.
+    """
+    settings, laws = recorded.settings, run_laws(recorded.settings)
+    scales = recorded.summary["drive"]
+    units = DriveUnits(math.tau / scales["rad_per_count"], 1000.0 * scales["nm_per_mille"])
+    # No frames are needed here: the record stands for what they carried.
+    nothing = PdoLayout(0, ())
+    cycle = make_cycle(settings, DriveSetup(units, 0, nothing, nothing), laws)
+    set_wall(cycle, wall, laws)
+    y = recorded.column("y")
+    v = np.diff(y, prepend=y[0]) / settings.bus.cycle_s
+    seen = np.stack([y, v, *(recorded.column(c) for c in ("y_est", "v_est", "d_est"))])
+    held = np.zeros(len(y))
+    address = find_law(wall.law, wall.deadbeat).address
+    _hold(cycle["wall"][0], address, seen, units.nm_per_mille, settings.limits.torque_nm, held)
+    return held
+
+
+@compiled
+def _hold(
+    walls: NDArray[np.void], address: int, seen: Array, step: float, limit: float, held: Array
+) -> None:
+    wall: Record = walls[0]
+    for j in range(len(held) - 1):
+        wall.y_sample, wall.v_sample = seen[0, j], seen[1, j]
+        wall.y, wall.v, wall.d = seen[2, j], seen[3, j], seen[4, j]
+        held[j + 1] = to_per_mille(wall_force(address, wall), step, limit) * step
+        note_force(wall, held[j + 1])
+
+
+def meetings(t: Array, y: Array, level: Array) -> tuple[Array, int]:
+    """Where in its period each held level meets the position, 0 … 1, and of how many periods.
+
+    Of the periods that begin inside the wall. Between the samples the position is taken from a
+    cubic spline through them.
+    """
+    position = CubicSpline(t, y)
+    inside = [j for j in range(len(t) - 1) if y[j] < 0.0 and level[j] != 0.0]
+    met = []
+    for j in inside:
+        if (y[j] - level[j]) * (y[j + 1] - level[j]) <= 0.0:
+            at = brentq(lambda s, f=level[j]: float(position(s)) - f, t[j], t[j + 1])
+            met.append((at - t[j]) / (t[j + 1] - t[j]))
+    return np.array(met), len(inside)
+
+
+def _strikes(recorded: Recorded) -> Sheet:
+    title = "Figure 5.18: four strikes of a virtual wall, with two controllers"
+    figure, axes = blank(title, "time t [s]", "", (11.0, 4.8))
+    strikes = recorded.summary["strikes"]
+    laws = list(dict.fromkeys(strike["law"] for strike in strikes))
+    draw_strikes(axes, recorded.signals, strikes, dict(zip(laws, COLOURS, strict=False)))
+    axes.set_title(f"{title} (grey: inside)")
+    axes.tick_params(labelbottom=True)
+    axes.margins(x=0.01)
+    t, y = recorded.column("t_s"), recorded.column("y")
+    box = close_up(recorded)
+    low, high = y[box].min() * 1e3, y[box].max() * 1e3
+    axes.add_patch(
+        Rectangle(
+            (t[box][0], low - 5.0),
+            np.ptp(t[box]),
+            high - low + 10.0,
+            fill=False,
+            color=COLOURS[2],
+            lw=2.0,
+            zorder=3,
+        )
+    )
+    described = (
+        f"strike {number} ({strike['law']}): {strike['contacts']} "
+        f"contact{'s' if strike['contacts'] > 1 else ''}, "
+        + (
+            f"chatter at {strike['chatter_frequency_hz']:.1f} Hz with an amplitude of "
+            f"{strike['chatter_amplitude_rad'] * 1e3:.1f} mrad, "
+            if strike["chatter"]
+            else "no chatter, "
+        )
+        + f"{strike['energy_out_j'] * 1e3:.3g} mJ out"
+        for number, strike in enumerate(strikes, start=1)
+    )
+    return Sheet(
+        "figure_5_18",
+        title,
+        "Four strikes on the same wall with the controllers alternating: the old one chatters, "
+        "the new one does not.",
+        f"K = {recorded.settings.wall.stiffness_nm_per_rad:g} N·m/rad at "
+        f"{1.0 / recorded.settings.bus.cycle_s:g} Hz; " + "; ".join(described) + ".",
+        {
+            "t [s]": t,
+            "y [mrad]": y * 1e3,
+            "torque applied [N·m]": recorded.column("torque_applied"),
+            "law": np.asarray(recorded.signals["law"].to_pylist()),
+        },
+        figure,
+    )
+
+
+def _efforts(recorded: Recorded) -> Sheet:
+    (_, displayed), (_, other) = recorded.settings.walls[:2]
+    box = close_up(recorded)
+    stiffness = displayed.stiffness_nm_per_rad
+    t, y = recorded.column("t_s")[box], recorded.column("y")[box] * 1e3
+    shown = 0.0 - recorded.column("force_applied")[box] / stiffness * 1e3
+    hidden = 0.0 - effort(recorded, other)[box] / stiffness * 1e3
+    title = "Figure 5.19: close-up, with the effort of both controllers"
+    figure, axes = blank(title, "time t [s]", "position y, control effort as −f/K [mrad]")
+    axes.axhline(0.0, color="k", lw=0.8)
+    axes.plot(t, y, ".-", color=REFERENT, lw=0.9, ms=4.0, label="position y")
+    stairs(axes, t, shown, f"{displayed.law}, displayed")
+    stairs(axes, t, hidden, f"{other.law}, not displayed", color=COLOURS[1], ls="--")
+    axes.margins(x=0.01)
+    legend_below(figure, axes)
+    met, of = meetings(t, y, hidden)
+    met_shown, of_shown = meetings(t, y, shown)
+    return Sheet(
+        "figure_5_19",
+        title,
+        "With the stiffness scaled to unity, the new control effort (dashed, not displayed) meets "
+        "the position at the half-sample times; the old one (solid, displayed) lags it.",
+        f"{other.law} meets the position in {len(met)} of {of} periods, at {met.mean():.2f} of "
+        f"the period ({met.min():.2f} to {met.max():.2f}); {displayed.law} in {len(met_shown)} of "
+        f"{of_shown}: its force belongs to the sample before, because on the bus it takes effect "
+        "one SYNC later.",
+        {
+            "t [s]": t,
+            "y [mrad]": y,
+            f"-f/K {displayed.law} displayed [mrad]": shown,
+            f"-f/K {other.law} not displayed [mrad]": hidden,
+        },
+        figure,
+    )
