@@ -154,9 +154,14 @@ def _values(results: list[Result], name: str) -> Array:
     return np.array([getattr(result, name) for result in results])
 
 
-def _peaks(law: str, results: list[Result], referents: Mapping[float, Result]) -> Array:
-    damping = next(laws[law].damping for laws in GROUPS.values() if law in laws)
-    return _values(results, "peak") / referents[damping].peak
+def _shares(
+    name: str, results: Mapping[str, list[Result]], referents: Mapping[float, Result]
+) -> dict[str, Array]:
+    """A force of each law over the peak force of the continuous wall that it renders."""
+    damping = {law: choice.damping for laws in GROUPS.values() for law, choice in laws.items()}
+    return {
+        law: _values(of_law, name) / referents[damping[law]].peak for law, of_law in results.items()
+    }
 
 
 def _columns(
@@ -164,15 +169,15 @@ def _columns(
 ) -> dict[str, NDArray[np.generic]]:
     """One row for each law and θ."""
     rows = [result for of_law in results.values() for result in of_law]
-    peaks = [_peaks(law, of_law, referents) for law, of_law in results.items()]
+    tension, peak = (_shares(name, results, referents) for name in ("tension", "peak"))
     return {
         "law": np.repeat(list(results), len(grid)),
         "theta [1]": np.tile(grid, len(results)),
         "change of ln E, mean [1]": _values(rows, "mean"),
         "change of ln E, least [1]": _values(rows, "least"),
         "change of ln E, most [1]": _values(rows, "most"),
-        "largest tension [N]": _values(rows, "tension"),
-        "peak force over the continuous wall's [1]": np.concatenate(peaks),
+        "largest tension over the continuous wall's peak [1]": np.concatenate([*tension.values()]),
+        "peak force over the continuous wall's [1]": np.concatenate([*peak.values()]),
         "share of the balls that came out [1]": _values(rows, "out"),
     }
 
@@ -211,6 +216,7 @@ def _draw(
 ) -> Figure:
     figure = Figure(figsize=(13.0, 11.0), layout="constrained", dpi=120)
     grids = figure.subplots(3, len(GROUPS), sharex=True, sharey="row", squeeze=False)
+    tensions, peaks = (_shares(name, results, referents) for name in ("tension", "peak"))
     for column, (group, laws) in zip(grids.T, GROUPS.items(), strict=True):
         energy, tension, peak = column
         energy.set_title(group)
@@ -231,9 +237,8 @@ def _draw(
                 alpha=0.12,
                 lw=0.0,
             )
-            depth = referents[0.0].peak
-            tension.plot(grid, _values(found, "tension") / depth, **style)
-            peak.plot(grid, _peaks(law, found, referents), **style)
+            tension.plot(grid, tensions[law], **style)
+            peak.plot(grid, peaks[law], **style)
         if any(choice.damping for choice in laws.values()):
             label = f"continuous, B = {DAMPING:g} N·s/m"
             energy.axhline(referents[DAMPING].mean, color=REFERENT, ls="--", lw=1.1, label=label)

@@ -158,7 +158,7 @@ def _strikes(recorded: Recorded) -> Sheet:
             if strike["chatter"]
             else "no chatter, "
         )
-        + f"{strike['energy_out_j'] * 1e3:.3g} mJ out"
+        + f"{strike['energy_out_j']:.3g} J out"
         for number, strike in enumerate(strikes, start=1)
     )
     return Sheet(
