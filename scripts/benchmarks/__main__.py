@@ -1,0 +1,51 @@
+"""`scripts/bench [NAME ...]`: benchmarks, one function each, as one JSON object.
+
+What is compared is measured within one run, in turns, and given as a ratio: the machine drops out
+of it. Medians over repeats; the numbers of one machine say little about those of another.
+"""
+
+import json
+import os
+import platform
+import sys
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+from on_the_ball import ball, law_steps, planning_steps
+from on_the_bus import exchange, simulated_drive, whole_loop
+
+Benchmark: TypeAlias = Callable[[], dict[str, Any]]
+
+BENCHMARKS: dict[str, Benchmark] = {
+    "whole_loop": whole_loop,
+    "exchange": exchange,
+    "simulated_drive": simulated_drive,
+    "law_steps": law_steps,
+    "planning_steps": planning_steps,
+    "ball": ball,
+}
+
+
+def main() -> None:
+    """Run the benchmarks that are named."""
+    names = sys.argv[1:] or list(BENCHMARKS)
+    unknown = [name for name in names if name not in BENCHMARKS]
+    if unknown:
+        print(
+            f"bench: no benchmark {unknown[0]!r}; there are {', '.join(BENCHMARKS)}",
+            file=sys.stderr,
+        )
+        sys.exit(2)
+    results: dict[str, Any] = {
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "processors": os.cpu_count(),
+    }
+    for name in names:
+        print(f"bench: {name}", file=sys.stderr)
+        results[name] = BENCHMARKS[name]()
+    print(json.dumps(results, indent=2))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,123 @@
+"""`canwall` in processes of its own, and what its runs leave behind."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import can
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from rig import RPDO1, SIM_CONFIG, SYNC, TPDO1
+
+from canwall import config
+from canwall.record import read_signals
+
+COMMAND = str(Path(sys.executable).with_name("canwall"))
+PATIENCE_S = 60.0
+
+Start: TypeAlias = Callable[..., "subprocess.Popen[str]"]
+"""Starts a program that is ended with the test: arguments of its command line."""
+
+
+def command(*arguments: object, cwd: Path | None = None) -> "subprocess.CompletedProcess[str]":
+    """`canwall ARGUMENTS`, waited for."""
+    return subprocess.run(
+        [COMMAND, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        cwd=cwd,
+        check=False,
+    )
+
+
+def config_file(
+    path: Path, changes: dict[str, str] | None = None, source: Path = SIM_CONFIG
+) -> Path:
+    """A copy of a configuration with other text in places, its EDS by its full path."""
+    text = source.read_text()
+    eds = str(config.shipped("eds/canwall-drive.eds"))
+    for old, new in {'"../eds/canwall-drive.eds"': f'"{eds}"', **(changes or {})}.items():
+        assert old in text or new in text, old
+        text = text.replace(old, new)
+    path.write_text(text)
+    return path
+
+
+@dataclass(frozen=True)
+class Record:
+    """A run's folder, read."""
+
+    folder: Path
+
+    @cached_property
+    def signals(self) -> pa.Table:
+        return read_signals(self.folder / "signals.parquet")
+
+    def column(self, name: str) -> NDArray[Any]:
+        column: NDArray[Any] = self.signals[name].to_numpy()
+        return column
+
+    @cached_property
+    def summary(self) -> dict[str, Any]:
+        content: dict[str, Any] = json.loads((self.folder / "summary.json").read_text())
+        return content
+
+    @cached_property
+    def frames(self) -> list[can.Message]:
+        return read_log(self.folder / "bus.log")
+
+    @cached_property
+    def cycles(self) -> list[tuple[bytes | None, bytes]]:
+        """Data of TPDO (None: missing) and RPDO of each SYNC, as bus.log has them."""
+        cycles: list[tuple[bytes | None, bytes]] = []
+        tpdo: bytes | None = None
+        for frame in self.frames:
+            if frame.arbitration_id == SYNC:
+                tpdo = None
+            elif frame.arbitration_id == TPDO1:
+                tpdo = bytes(frame.data)
+            elif frame.arbitration_id == RPDO1:
+                cycles.append((tpdo, bytes(frame.data)))
+        return cycles
+
+
+def read_log(path: Path) -> list[can.Message]:
+    with can.LogReader(path) as reader:
+        return list(reader)
+
+
+def same_signals(one: Record, other: Record, rows: int | None = None) -> bool:
+    """Whether two runs have the same (first) rows, bit by bit, but for what the clock decides."""
+    columns = [n for n in one.signals.column_names if n not in ("sync_interval_s", "latency_s")]
+    a, b = (record.signals.select(columns).slice(0, rows) for record in (one, other))
+    for name in columns:
+        left, right = a[name].to_numpy(), b[name].to_numpy()
+        if not np.array_equal(left, right):
+            return False
+    return bool(a.schema.equals(b.schema))
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def torque_is_on(bus_log: Path) -> bool:
+    """Whether the log has an RPDO with a torque by now."""
+    if not bus_log.exists():
+        return False
+    with bus_log.open("rb") as file:
+        file.seek(max(0, os.path.getsize(bus_log) - 4000))
+        words = [line.split()[2] for line in file.read().splitlines()[1:-1]]
+    return any(word.startswith(b"205#0F00") and word[8:12] != b"0000" for word in words)

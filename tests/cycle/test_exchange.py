@@ -1,0 +1,207 @@
+"""One cycle's frames over python-can: what is late, short, missing or slow, and the SYNC's grid."""
+
+import time
+from types import SimpleNamespace
+
+import can
+import numpy as np
+import pytest
+from rig import RPDO1, SYNC, TPDO1, Loop, Rig, RigFactory
+
+from canwall.cycle import exchange as exchange_module
+from canwall.record.ring import FRAMES
+
+PERIOD_NS = 1_000_000
+
+
+def tpdo(counts: int) -> can.Message:
+    data = counts.to_bytes(4, "little", signed=True) + b"\x50\x02\0\0"
+    return can.Message(arbitration_id=TPDO1, data=data, is_extended_id=False)
+
+
+@pytest.fixture
+def rig(make_rig: RigFactory, monkeypatch: pytest.MonkeyPatch) -> Rig:
+    monkeypatch.setattr(exchange_module, "_SIMULATED_TIMEOUT_S", 0.05)
+    return make_rig()
+
+
+def test_one_cycle_is_sync_tpdo_rpdo(rig: Rig) -> None:
+    loop = Loop(rig)
+    rig.frames.clear()
+    loop.exchange.cycle()
+    cyclic = [frame for frame in rig.frames if frame[0] in (SYNC, TPDO1, RPDO1)]
+    assert [can_id for can_id, _ in cyclic] == [SYNC, TPDO1, RPDO1]
+    assert [len(data) for _, data in cyclic] == [0, 8, 4]
+
+
+def test_tpdo_that_comes_late_is_not_taken_for_the_next(rig: Rig) -> None:
+    loop = Loop(rig)
+    rig.tampering.mute.add(TPDO1)
+    loop.exchange.cycle()
+    rig.drive_bus.send(tpdo(111))  # the one that was missed
+    rig.tampering.mute.clear()
+    for _ in range(3):
+        loop.exchange.cycle()
+    rows = loop.rows()
+    assert rows["received"].tolist() == [False, True, True, True]
+    assert 111 not in rows["counts"]
+
+
+def test_emergencies_among_the_late_frames_are_heard(rig: Rig) -> None:
+    loop = Loop(rig)
+    rig.tampering.mute.add(TPDO1)
+    loop.exchange.cycle()
+    rig.inject(0x085, b"\x30\x81\x11\0\0\0\0\0")
+    loop.exchange.cycle()
+    assert [emergency.code for emergency in rig.node.emergencies] == [0x8130]
+
+
+def test_tpdo_that_is_too_short_is_none(rig: Rig) -> None:
+    loop = Loop(rig)
+    loop.exchange.cycle()
+    rig.drive_bus.send(can.Message(arbitration_id=TPDO1, data=bytes(7), is_extended_id=False))
+    loop.exchange.cycle()
+    loop.exchange.cycle()
+    rows = loop.rows()
+    assert rows["received"].tolist() == [True, False, True]
+    assert rows["counts"][1] == rows["counts"][0]
+
+
+def test_timing_columns(rig: Rig) -> None:
+    loop = Loop(rig)
+    for _ in range(3):
+        loop.exchange.cycle()
+    rows = loop.rows()
+    assert rows["sync_interval_s"][0] == 0.0
+    assert (rows["sync_interval_s"][1:] > 0.0).all()
+    assert (rows["latency_s"] > 0.0).all()
+    assert loop.exchange.sync_interval["counts"].sum() == 2
+    assert loop.exchange.latency["counts"].sum() == 3
+    largest = float(loop.exchange.latency["largest_ns"][0])
+    assert largest == pytest.approx(rows["latency_s"].max() * 1e9)
+
+
+def test_warming_up_leaves_no_trace(rig: Rig) -> None:
+    loop = Loop(rig)
+    assert loop.record["j"][0] == 0
+    assert loop.record["missed_tpdo"][0] == 0
+    assert len(loop.rows()) == 0
+    assert loop.exchange.latency["counts"].sum() == 0
+
+
+# The record
+
+
+def test_simulated_time_waits_for_the_writer_of_the_record(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loop = Loop(rig)
+    loop.ring.header["frame_head"] = FRAMES  # full
+    naps = []
+
+    def nap(duration_s: float) -> None:
+        naps.append(duration_s)
+        if len(naps) == 3:
+            loop.ring.take_frames()
+
+    monkeypatch.setattr(exchange_module, "time", fake_time(sleep=nap))
+    loop.exchange.cycle()
+    assert len(naps) == 3
+    loop.exchange.cycle()
+    assert len(naps) == 3
+
+
+def test_writer_that_is_gone_is_not_waited_for_for_ever(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loop = Loop(rig)
+    loop.ring.header["frame_head"] = FRAMES
+    slept = []
+    monkeypatch.setattr(
+        exchange_module, "time", fake_time(sleep=slept.append, monotonic=lambda: len(slept))
+    )
+    loop.exchange.cycle()
+    assert 0 < len(slept) < 20
+    before = len(slept)
+    loop.exchange.cycle()
+    assert len(slept) == before
+
+
+def fake_time(**functions: object) -> SimpleNamespace:
+    return SimpleNamespace(**{**vars(time), **functions})
+
+
+# Real time: the SYNCs' instants, by a clock of the test's own
+
+
+class Clock:
+    """A clock that moves only by sleeping, and by what a test says a cycle takes."""
+
+    def __init__(self) -> None:
+        self.now_ns = 5_000_000_000
+        self.oversleep_ns = 0
+
+    def perf_counter_ns(self) -> int:
+        return self.now_ns
+
+    def sleep(self, duration_s: float) -> None:
+        self.now_ns += round(duration_s * 1e9) + self.oversleep_ns
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(
+        exchange_module,
+        "time",
+        fake_time(perf_counter_ns=clock.perf_counter_ns, sleep=clock.sleep),
+    )
+    return clock
+
+
+def syncs(loop: Loop, clock: Clock, cycle_takes_ns: list[int]) -> list[float]:
+    """Instants of the SYNCs in periods since the first; each cycle takes as long as given."""
+    instants: list[int] = []
+    send = loop.rig.link.send
+
+    def noting(message: can.Message) -> None:
+        if message.arbitration_id == SYNC:
+            instants.append(clock.now_ns)
+        send(message)
+
+    loop.rig.link.send = noting  # type: ignore[method-assign]
+    for duration in cycle_takes_ns:
+        loop.exchange.cycle()
+        clock.now_ns += duration
+    return ((np.array(instants) - instants[0]) / PERIOD_NS).tolist()
+
+
+def test_syncs_keep_to_absolute_deadlines(rig: Rig, clock: Clock) -> None:
+    loop = Loop(rig, real_time=True)
+    clock.oversleep_ns = 60_000
+    durations = [100_000 * (j % 7) for j in range(50)]
+    instants = syncs(loop, clock, durations)
+    # Each is late by what the sleep took too long, and none passes it on to the next.
+    assert instants == pytest.approx([0.0, *(j + 0.06 for j in range(1, 50))])
+    assert loop.exchange.late_rpdo == 0
+
+
+def test_late_cycle_is_not_made_up_for_by_a_burst(rig: Rig, clock: Clock) -> None:
+    loop = Loop(rig, real_time=True)
+    instants = syncs(loop, clock, [0, 0, 3_400_000, 0, 0])
+    assert instants == pytest.approx([0.0, 1.0, 2.0, 5.4, 6.0])
+
+
+def test_rpdo_after_the_next_sync_was_due_is_late(rig: Rig, clock: Clock) -> None:
+    loop = Loop(rig, real_time=True)
+    send = rig.link.send
+
+    def slow(message: can.Message) -> None:
+        send(message)
+        if message.arbitration_id == RPDO1 and loop.record["j"][0] == 3:
+            clock.now_ns += 1_100_000
+
+    rig.link.send = slow  # type: ignore[method-assign]
+    for _ in range(6):
+        loop.exchange.cycle()
+    assert loop.exchange.late_rpdo == 1

@@ -1,0 +1,373 @@
+"""The whole loop against the simulated drive: one way in, one way out, whatever happens."""
+
+import gc
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+from can.interfaces.virtual import VirtualBus
+from numpy.typing import NDArray
+from rig import RPDO1, SDO_REQUEST, SYNC, TPDO1, Loop, Rig, RigFactory, settings_with
+
+from canwall.config import Settings
+from canwall.cycle import Change, Outcome, run_loop
+from canwall.cycle import exchange as exchange_module
+from canwall.record import Phase
+
+#: The hand strikes from cycle 200 on; by this one it rests on the wall and presses until 800.
+PRESSING = 500
+UP, DOWN = [0x00, 0x06, 0x07, 0x0F], [0x07, 0x06, 0x00]
+
+
+@pytest.fixture(autouse=True)
+def _no_long_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exchange_module, "_SIMULATED_TIMEOUT_S", 0.02)
+    monkeypatch.setattr(exchange_module, "_MISSING_TIMEOUT_S", 0.002)
+
+
+@pytest.fixture(autouse=True)
+def _collector_is_as_before() -> Any:
+    assert gc.isenabled()
+    yield
+    assert gc.isenabled()
+    assert gc.get_freeze_count() == 0
+
+
+def pressing(overrides: dict[str, Any] | None = None) -> Settings:
+    """A wall on which the hand rests, so that there is a torque to be taken away."""
+    return settings_with({"wall.law": "half_sample"} | (overrides or {}))
+
+
+def steps(words: list[int]) -> list[int]:
+    """Controlwords without their repetitions."""
+    return [word for word, before in zip(words, [None, *words], strict=False) if word != before]
+
+
+def assert_ended_in_order(loop: Loop, outcome: Outcome, rows: NDArray[np.void]) -> None:
+    """Zero torque on the bus as the state machine goes down, and the drive says it is down."""
+    leaving = rows[rows["phase"] == Phase.LEAVING]
+    assert outcome.disabled
+    assert not leaving["torque_cmd_per_mille"].any()
+    assert loop.rig.rpdos()[-len(leaving) :] == [(int(w), 0) for w in leaving["controlword"]]
+    assert steps(leaving["controlword"].tolist()) == DOWN
+    assert loop.rig.node.read(0x6041) & 0x6F == 0x40
+    assert loop.rig.node.read(0x6077) == 0
+
+
+def assert_never_enabled(loop: Loop) -> None:
+    assert all(torque == 0 for _, torque in loop.rig.rpdos())
+    assert all(word & 0x0F != 0x0F for word, _ in loop.rig.rpdos())
+
+
+# In order
+
+
+def test_in_and_out(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing()))
+    collecting: list[bool] = []
+
+    def listen(j: int) -> bool:
+        collecting.append(gc.isenabled())
+        return False
+
+    outcome = loop.run(500, listen)
+    assert outcome.trips == []
+    assert not outcome.interrupted
+    rows = loop.rows()
+    assert outcome.cycles == len(rows) == rows["j"][-1] + 1
+    assert rows["j"].tolist() == list(range(len(rows)))
+    assert np.diff(rows["phase"].astype(int)).min() == 0  # enabling, rendering, leaving
+    assert rows["j"][rows["phase"] == Phase.RENDERING][-1] == 499
+    enabling = rows[rows["phase"] == Phase.ENABLING]
+    assert steps(enabling["controlword"].tolist()) == UP[: len(steps(enabling["controlword"]))]
+    assert not enabling["torque_cmd_per_mille"].any()
+    assert np.abs(rows["torque_cmd_per_mille"]).max() > 50
+    assert not any(collecting)
+    assert_ended_in_order(loop, outcome, rows)
+
+
+def test_torque_is_applied_by_the_sync_after_the_rpdo(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing()))
+    loop.run(500)
+    rows = loop.rows()
+    nm = loop.setup.units.nm_per_mille
+    assert np.array_equal(rows["torque_applied"][1:], rows["torque_cmd_per_mille"][:-1] * nm)
+
+
+def test_stopped_in_the_middle(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing()))
+    outcome = loop.run(None, lambda j: j >= PRESSING)
+    assert outcome.interrupted
+    assert outcome.trips == []
+    assert loop.rig.rpdos()[PRESSING - 1][1] != 0
+    assert_ended_in_order(loop, outcome, loop.rows())
+    assert outcome.cycles < PRESSING + 10
+
+
+@pytest.mark.parametrize("j", [0, 1, 3])
+def test_stopped_while_enabling(make_rig: RigFactory, j: int) -> None:
+    loop = Loop(make_rig(pressing()))
+    outcome = loop.run(None, lambda now: now >= j)
+    assert outcome.interrupted
+    assert outcome.disabled
+    assert all(torque == 0 for _, torque in loop.rig.rpdos())
+    assert loop.rig.node.read(0x6041) & 0x6F == 0x40
+
+
+def test_changes_take_effect_at_their_cycle(make_rig: RigFactory) -> None:
+    rig = make_rig(settings_with())  # its schedule has both laws
+    loop = Loop(rig)
+    wall = rig.settings.wall
+    changes = [
+        Change(300, wall.model_copy(update={"law": "half_sample"})),
+        Change(310, wall.model_copy(update={"stiffness_nm_per_rad": 20.0})),
+        Change(310, wall.model_copy(update={"position_rad": -0.01})),
+    ]
+    loop.run(400, changes=changes)
+    rows = loop.rows()
+    assert np.flatnonzero(np.diff(rows["law"])).tolist() == [299, 309]
+    assert np.flatnonzero(np.diff(rows["wall_position_rad"])).tolist() == [309]
+    assert rows["wall_position_rad"][310] == -0.01
+    assert set(rows["stiffness"]) == {50.0}  # the later change of the same cycle has the last word
+
+
+def test_progress_is_told_now_and_then(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing()))
+    told: list[int] = []
+    run_loop(
+        loop.exchange,
+        loop.record,
+        loop.rig.node,
+        loop.laws,
+        [],
+        450,
+        lambda: False,
+        told.append,
+    )
+    assert told == [100, 200, 300, 400]
+
+
+# Before enabling
+
+
+def test_start_inside_the_wall_is_refused(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing({"wall.position_rad": 0.25})))
+    outcome = loop.run(500)
+    (trip,) = outcome.trips
+    assert trip == "the handle is 0.15 rad inside the wall: move it out, or wall.position_rad"
+    assert outcome.disabled
+    assert_never_enabled(loop)
+
+
+def test_no_tpdo_at_all(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing()))
+    loop.rig.tampering.mute.add(TPDO1)
+    outcome = loop.run(500)
+    assert outcome.trips == ["no TPDO within 10 SYNCs"]
+    assert not outcome.disabled
+    assert_never_enabled(loop)
+    assert loop.rig.node.read(0x6041) & 0x6F == 0x40
+
+
+def test_drive_that_never_enables(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing()))
+    loop.rig.tampering.deaf.add(RPDO1)
+    outcome = loop.run(500)
+    assert outcome.trips == ["the drive stays in SWITCH ON DISABLED (statusword 0x0250)"]
+    assert outcome.disabled
+    assert all(torque == 0 for _, torque in loop.rig.rpdos())
+
+
+def test_drive_that_falls_silent_while_it_is_enabled(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing()))
+
+    def silence(j: int) -> bool:
+        if j == 2:
+            loop.rig.tampering.mute.add(TPDO1)
+        return False
+
+    outcome = loop.run(500, silence)
+    assert outcome.trips == ["no TPDO for 50 cycles while enabling"]
+    assert not outcome.disabled
+    assert all(torque == 0 for _, torque in loop.rig.rpdos())
+
+
+def test_drive_in_fault_is_reset(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing()))
+    node = loop.rig.node
+    for word in (0x06, 0x07, 0x0F):
+        node.write(0x6040, 0, word)
+    node.command("PRE-OPERATIONAL")
+    while node.read(0x6041) & 0x4F != 0x08:
+        pass
+    node.command("OPERATIONAL")
+    outcome = loop.run(300)
+    assert outcome.trips == []
+    assert steps([word for word, _ in loop.rig.rpdos()])[:6] == [0x00, 0x80, 0x00, 0x06, 0x07, 0x0F]
+    assert_ended_in_order(loop, outcome, loop.rows())
+
+
+# Trips
+
+
+def trip_of(loop: Loop, happens: Callable[[int], None]) -> str:
+    """What ends the run when something happens in the middle of the contact."""
+
+    def once(j: int) -> bool:
+        if j == PRESSING:
+            happens(j)
+        return j > 20_000
+
+    outcome = loop.run(None, once)
+    (trip,) = outcome.trips
+    assert not outcome.interrupted
+    torques = [torque for _, torque in loop.rig.rpdos()]
+    assert torques[PRESSING - 1] != 0
+    return trip
+
+
+def test_drive_that_another_master_disables(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing()))
+    disable = struct.pack("<BHBL", 0x2B, 0x6040, 0, 0)
+    trip = trip_of(loop, lambda j: loop.rig.inject(SDO_REQUEST, disable))
+    assert trip == (
+        "cycle 500 (0.500 s): the drive left OPERATION ENABLED: SWITCH ON DISABLED "
+        "(statusword 0x0250)"
+    )
+    assert loop.rig.rpdos()[-1] == (0x00, 0)
+
+
+def test_drive_in_fault_is_named_with_its_emergency(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing()))
+    loop.rig.node.write(0x1016, 1, 0x7F0001)  # misses the heartbeat of node 127 after 1 ms
+    trip = trip_of(loop, lambda j: loop.rig.inject(0x77F, b"\x05"))
+    assert "the drive left OPERATION ENABLED: FAULT" in trip
+    assert "EMCY 0x8130" in trip
+    assert loop.rig.rpdos()[-1][1] == 0
+
+
+def test_drive_that_falls_silent(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing({"limits.hold_cycles": 3, "limits.ramp_cycles": 5})))
+    trip = trip_of(loop, lambda j: loop.rig.tampering.mute.add(TPDO1))
+    assert trip == "cycle 507 (0.507 s): no TPDO for 8 cycles"
+    rpdos = loop.rig.rpdos()
+    held = rpdos[PRESSING - 1][1]
+    torques = [torque for _, torque in rpdos[PRESSING : PRESSING + 8]]
+    assert torques[:3] == [held] * 3
+    assert torques[3:] == pytest.approx([held * (4 - i) / 5 for i in range(5)], abs=1.5)
+    # It hears though it is not heard: quick stop, then down.
+    assert rpdos[PRESSING + 8] == (0x02, 0)
+    assert all(rpdo == (0x07, 0) for rpdo in rpdos[PRESSING + 9 :])
+    assert loop.rig.node.read(0x6041) & 0x6F in (0x40, 0x07)
+
+
+def test_speed_and_position_limits_end_the_run(make_rig: RigFactory) -> None:
+    for limit, value, text in (
+        ("limits.speed_rad_s", 0.5, "rad/s beyond limits.speed_rad_s"),
+        ("limits.position_rad", [-1.0, 0.05], "outside limits.position_rad"),
+    ):
+        loop = Loop(make_rig(pressing({limit: value})))
+        outcome = loop.run(1000)
+        (trip,) = outcome.trips
+        assert text in trip
+        assert_ended_in_order(loop, outcome, loop.rows())
+
+
+# A bus that fails
+
+
+class FailingBus(VirtualBus):
+    """Fails to send what `fails` picks."""
+
+    fails: Callable[[can.Message], bool] = staticmethod(lambda message: False)
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        if self.fails(msg):
+            raise can.CanOperationError("transmit buffer full")
+        super().send(msg, timeout)
+
+
+def failing_rig(make_rig: RigFactory) -> tuple[Rig, FailingBus]:
+    rig = make_rig(pressing(), bus=FailingBus)
+    assert isinstance(rig.bus, FailingBus)
+    return rig, rig.bus
+
+
+def test_bus_that_fails_once_is_left_in_order(make_rig: RigFactory) -> None:
+    rig, bus = failing_rig(make_rig)
+    loop = Loop(rig)
+    times = 0
+
+    def once(message: can.Message) -> bool:
+        nonlocal times
+        times += message.arbitration_id == RPDO1
+        return times == PRESSING and message.arbitration_id == RPDO1
+
+    bus.fails = once
+    outcome = loop.run(None)
+    assert outcome.trips == ["the bus failed: transmit buffer full"]
+    assert_ended_in_order(loop, outcome, loop.rows())
+
+
+@pytest.mark.parametrize("can_id", [SYNC, RPDO1])
+def test_cycle_that_fails_for_good_is_left_by_sdo(make_rig: RigFactory, can_id: int) -> None:
+    rig, bus = failing_rig(make_rig)
+    loop = Loop(rig)
+
+    def fail_from_now_on(j: int) -> bool:
+        if j == PRESSING:
+            bus.fails = lambda message: message.arbitration_id == can_id
+        return False
+
+    outcome = loop.run(None, fail_from_now_on)
+    assert outcome.trips == [
+        "the bus failed: transmit buffer full",
+        "the bus failed while leaving: transmit buffer full",
+    ]
+    assert outcome.disabled
+    assert rig.node.read(0x6041) & 0x6F == 0x40
+    assert rig.node.read(0x6071) == 0
+
+
+def test_bus_that_is_gone(make_rig: RigFactory) -> None:
+    rig, bus = failing_rig(make_rig)
+    loop = Loop(rig)
+
+    def fail_from_now_on(j: int) -> bool:
+        if j == PRESSING:
+            bus.fails = lambda message: True
+        return False
+
+    outcome = loop.run(None, fail_from_now_on)
+    assert len(outcome.trips) == 3
+    assert outcome.trips[2].startswith("the drive could not be disabled: node 5: writing 0x0 to")
+    assert not outcome.disabled
+    assert not any("\n" in trip for trip in outcome.trips)
+
+
+def test_bus_that_fails_at_the_very_first_frame(make_rig: RigFactory) -> None:
+    rig, bus = failing_rig(make_rig)
+    loop = Loop(rig)
+    bus.fails = lambda message: message.arbitration_id == SYNC
+    outcome = loop.run(None)
+    assert outcome.trips[0] == "the bus failed: transmit buffer full"
+    assert outcome.cycles == 0
+    assert outcome.disabled
+
+
+def test_exception_of_the_program_itself_ends_in_order(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing()))
+
+    def wrong(j: int) -> bool:
+        if j == PRESSING:
+            raise ZeroDivisionError
+        return False
+
+    with pytest.raises(ZeroDivisionError):
+        loop.run(None, wrong)
+    assert steps([word for word, _ in loop.rig.rpdos()])[-3:] == DOWN
+    assert loop.rig.rpdos()[-1] == (0x00, 0)
+    assert loop.rig.node.read(0x6041) & 0x6F == 0x40

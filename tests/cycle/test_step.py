@@ -1,0 +1,345 @@
+"""One cycle without a bus: frames' data in and out, holding, trips, walls on either side."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from rig import settings_with
+
+from canwall.config import ConfigError, Settings
+from canwall.cycle import Trip, make_cycle, set_wall, step
+from canwall.cycle.step import start_at
+from canwall.drive import DriveSetup, Field, PdoLayout
+from canwall.record import ROW, Phase
+from canwall.run import run_laws
+from canwall.units import DriveUnits
+from canwall.walls import UnknownLawError
+
+ENABLED = 0x0237
+POSITION, STATUSWORD, TORQUE = 0x6064, 0x6041, 0x6077
+CONTROLWORD, TARGET = 0x6040, 0x6071
+
+TPDO = PdoLayout(
+    0x185, (Field(POSITION, 0, 0, 32), Field(STATUSWORD, 0, 32, 16), Field(TORQUE, 0, 48, 16))
+)
+RPDO = PdoLayout(0x205, (Field(CONTROLWORD, 0, 0, 16), Field(TARGET, 0, 16, 16)))
+#: A count is 1 mrad, a per mille 1 mN·m.
+UNITS = DriveUnits(2000.0 * np.pi, 1.0)
+
+
+class Wall:
+    """One wall on one drive, cycle by cycle."""
+
+    def __init__(
+        self,
+        overrides: dict[str, Any] | None = None,
+        tpdo: PdoLayout = TPDO,
+        rpdo: PdoLayout = RPDO,
+    ) -> None:
+        # The estimator is to follow what the tests make the handle do.
+        self.settings: Settings = settings_with(
+            {"wall.law": "standard", "limits.torque_nm": 30.0} | (overrides or {})
+        )
+        self.laws = run_laws(self.settings)
+        self.cycle = make_cycle(self.settings, DriveSetup(UNITS, 0x80, tpdo, rpdo), self.laws)
+        self.cycle["phase"] = Phase.RENDERING
+        self.row = np.zeros(1, ROW)
+
+    def give(self, data: int) -> int:
+        """TPDO data in, RPDO data out, both as unsigned numbers."""
+        signed = data - (1 << 64) if data >> 63 else data
+        return step(self.cycle, self.row, signed, True) & (1 << 64) - 1
+
+    def at(self, counts: int, statusword: int = ENABLED) -> int:
+        """A TPDO with this position; returns the torque that the RPDO carries."""
+        data = counts & 0xFFFFFFFF | statusword << 32 | self.torque() << 48 & 0xFFFF << 48
+        return self._sent(self.give(data))
+
+    def missing(self) -> int:
+        """No TPDO; returns the torque that the RPDO carries."""
+        return self._sent(step(self.cycle, self.row, 0, False))
+
+    def torque(self) -> int:
+        return int(self.row["torque_cmd_per_mille"][0])
+
+    def trip(self) -> Trip:
+        return Trip(int(self.cycle["trip"][0]))
+
+    def _sent(self, answer: int) -> int:
+        torque = (answer >> 16 & 0xFFFF ^ 0x8000) - 0x8000
+        assert torque == self.torque()
+        return torque
+
+
+# Frames
+
+
+@st.composite
+def layouts(draw: st.DrawFn, objects: dict[int, tuple[int, int]], length: int) -> PdoLayout:
+    """Objects in any order with gaps between them; the bits of each are drawn from its range."""
+    order = draw(st.permutations(list(objects)))
+    bits = {index: draw(st.integers(*objects[index])) for index in order}
+    spare = length - sum(bits.values())
+    fields, shift = [], 0
+    for index in order:
+        gap = draw(st.integers(0, spare))
+        spare -= gap
+        fields.append(Field(index, 0, shift + gap, bits[index]))
+        shift += gap + bits[index]
+    return PdoLayout(0x185, tuple(fields))
+
+
+def value_of(data: int, field: Field | None, signed: bool) -> int:
+    assert field is not None
+    value = data // 2**field.shift % 2**field.bits
+    return value - 2**field.bits if signed and value >= 2 ** (field.bits - 1) else value
+
+
+@settings(deadline=None, max_examples=80)
+@given(
+    layout=layouts({POSITION: (2, 32), STATUSWORD: (7, 16), TORQUE: (2, 16)}, 64),
+    data=st.integers(0, 2**64 - 1),
+)
+def test_values_are_taken_from_any_layout(layout: PdoLayout, data: int) -> None:
+    wall = Wall(tpdo=layout)
+    wall.give(data)
+    assert wall.row["counts"][0] == value_of(data, layout.field(POSITION), signed=True)
+    assert wall.row["statusword"][0] == value_of(data, layout.field(STATUSWORD), signed=False)
+    torque = value_of(data, layout.field(TORQUE), signed=True)
+    assert wall.row["torque_applied"][0] == torque * UNITS.nm_per_mille
+
+
+@settings(deadline=None, max_examples=80)
+@given(
+    layout=layouts({CONTROLWORD: (16, 16), TARGET: (16, 16)}, 64),
+    controlword=st.integers(0, 0xFFFF),
+    depth=st.integers(0, 700),
+    side=st.sampled_from(["below", "above"]),
+)
+def test_values_are_put_into_any_layout(
+    layout: PdoLayout, controlword: int, depth: int, side: str
+) -> None:
+    wall = Wall({"wall.side": side, "limits.speed_rad_s": 1e9}, rpdo=layout)
+    wall.cycle["controlword"] = controlword
+    outwards = 1 if side == "below" else -1
+    answer = wall.give(-outwards * depth & 0xFFFFFFFF | ENABLED << 32)
+    assert wall.torque() == outwards * min(50 * depth, 30_000)
+    field_c, field_t = layout.field(CONTROLWORD), layout.field(TARGET)
+    assert field_c is not None
+    assert field_t is not None
+    assert answer == controlword * 2**field_c.shift + wall.torque() % 2**16 * 2**field_t.shift
+
+
+def test_without_torque_actual_value_the_last_command_is_in_force() -> None:
+    wall = Wall(tpdo=PdoLayout(0x185, TPDO.fields[:2]))
+    wall.at(0)
+    commanded = wall.at(-3)
+    assert commanded == 150
+    wall.at(-4)
+    assert wall.row["torque_applied"][0] == pytest.approx(0.150)
+
+
+def test_row_of_a_cycle() -> None:
+    wall = Wall({"wall.position_rad": 0.01})
+    start_at(wall.cycle, 20)
+    wall.cycle["controlword"] = 0x0F
+    for counts in (20, 20, 4):
+        wall.at(counts)
+    row = wall.row[0]
+    assert row["j"] == 2
+    assert row["t_s"] == pytest.approx(0.002)
+    assert row["phase"] == Phase.RENDERING
+    assert row["received"]
+    assert row["statusword"] == ENABLED
+    assert row["controlword"] == 0x0F
+    assert row["position_rad"] == pytest.approx(0.004)
+    assert row["y"] == pytest.approx(-0.006)
+    assert row["force"] == pytest.approx(0.3)
+    assert row["torque_cmd_per_mille"] == 300
+    assert row["torque_cmd"] == pytest.approx(0.3)
+    assert row["torque_applied"] == row["force_applied"] == 0.0
+    assert row["stiffness"] == 50.0
+    assert row["wall_position_rad"] == 0.01
+
+
+@pytest.mark.parametrize("phase", [Phase.ENABLING, Phase.LEAVING])
+def test_no_torque_but_while_rendering(phase: Phase) -> None:
+    wall = Wall()
+    wall.cycle["phase"] = phase
+    assert wall.at(-10) == 0
+    assert wall.at(-10, statusword=0) == 0
+    assert wall.trip() == Trip.NONE
+
+
+def test_torque_is_held_to_its_limit() -> None:
+    wall = Wall({"limits.torque_nm": 0.7})
+    assert wall.at(-13) == 650
+    assert wall.at(-15) == 700
+    assert wall.row["force"][0] == pytest.approx(0.75)
+
+
+# Missing TPDOs
+
+
+def test_missing_tpdos_hold_then_ramp_then_trip() -> None:
+    wall = Wall({"limits.hold_cycles": 2, "limits.ramp_cycles": 4})
+    assert wall.at(-20) == 1000
+    assert [wall.missing() for _ in range(5)] == [1000, 1000, 750, 500, 250]
+    assert wall.trip() == Trip.NONE
+    assert wall.missing() == 0
+    assert wall.trip() == Trip.MISSED_TPDO
+    assert wall.cycle["missed_tpdo"][0] == 6
+
+
+def test_tpdo_that_comes_back_ends_the_ramp() -> None:
+    wall = Wall({"limits.hold_cycles": 1, "limits.ramp_cycles": 10})
+    wall.at(-20)
+    assert [wall.missing() for _ in range(3)] == [1000, 900, 800]
+    assert not wall.row["received"][0]
+    assert wall.at(-20) == 1000
+    assert [wall.missing() for _ in range(2)] == [1000, 900]
+    assert wall.cycle["missed_tpdo"][0] == 5
+
+
+def test_no_hold_at_all() -> None:
+    wall = Wall({"limits.hold_cycles": 0, "limits.ramp_cycles": 1})
+    wall.at(-20)
+    assert wall.missing() == 0
+    assert wall.trip() == Trip.MISSED_TPDO
+
+
+def test_speed_after_missing_tpdos_is_that_of_the_motion() -> None:
+    overrides = {"wall.law": "damped", "wall.damping_nm_s_per_rad": 0.2}
+    seen, blind = Wall(overrides), Wall(overrides)
+    for wall in (seen, blind):
+        start_at(wall.cycle, 5)
+    torques = [seen.at(counts) for counts in (5, 2, -1, -4, -7)]
+    assert torques[-1] == 50 * 7 + 200 * 3
+    assert [blind.at(counts) for counts in (5, 2)] == torques[:2]
+    blind.missing(), blind.missing()
+    assert blind.at(-7) == torques[-1]
+
+
+# Trips
+
+
+def test_position_beyond_its_limits() -> None:
+    for counts, trip in ((-300, Trip.NONE), (-301, Trip.POSITION), (301, Trip.POSITION)):
+        wall = Wall({"limits.position_rad": [-0.3, 0.3], "limits.speed_rad_s": 1e9})
+        torque = wall.at(counts)
+        assert wall.trip() == trip
+        assert (torque == 0) == (trip is Trip.POSITION)
+
+
+def test_speed_beyond_its_limit() -> None:
+    wall = Wall({"limits.speed_rad_s": 10.0})
+    start_at(wall.cycle, 2500)
+    speeds = np.concatenate([np.linspace(0.0, 8.0, 200), np.full(50, 8.0)])  # counts per cycle
+    for counts in 2500 - np.cumsum(speeds):
+        wall.at(round(counts))
+    assert wall.row["v_est"][0] == pytest.approx(-8.0, abs=1.5)
+    assert wall.trip() == Trip.NONE
+    for j in range(50):
+        wall.at(1250 - 20 * j)
+    assert wall.trip() == Trip.SPEED
+    assert wall.at(-100) == 0
+
+
+def test_estimate_that_is_not_a_number_is_beyond_the_speed_limit() -> None:
+    wall = Wall()
+    wall.cycle["estimator"]["v"] = np.nan
+    assert wall.at(-10) == 0
+    assert wall.trip() == Trip.SPEED
+
+
+@pytest.mark.parametrize("statusword", [0x0250, 0x0231, 0x0233, 0x0217, 0x0218, 0x021F, 0x0000])
+def test_drive_that_is_not_enabled(statusword: int) -> None:
+    wall = Wall()
+    assert wall.at(-10) == 500
+    assert wall.at(-10, statusword) == 0
+    assert wall.trip() == Trip.NOT_ENABLED
+
+
+@pytest.mark.parametrize("value", ["math.nan", "math.inf", "-math.inf"])
+def test_law_whose_force_is_not_a_number(tmp_path: Path, value: str) -> None:
+    file = tmp_path / "wrong.py"
+    file.write_text(
+        f"import math\n\ndef wrong(wall):\n    return {value} if wall.y_sample < 0.0 else 0.0\n"
+    )
+    wall = Wall({"wall.law": f"{file}:wrong"})
+    assert wall.at(1) == 0
+    assert wall.trip() == Trip.NONE
+    assert wall.at(-10) == 0
+    assert wall.trip() == Trip.NOT_A_NUMBER
+    assert wall.row["force"][0] == 0.0
+
+
+# The wall
+
+
+def strike() -> NDArray[np.int64]:
+    """Counts of a handle that comes in, bounces and leaves."""
+    t = np.arange(400) * 1e-3
+    counts: NDArray[np.int64] = np.round(60.0 - 900.0 * t + 4.0 * np.sin(300.0 * t)).astype(int)
+    return np.concatenate([counts[:80], counts[80::-1]])
+
+
+@pytest.mark.parametrize("law", ["standard", "damped", "midpoint", "half_sample"])
+def test_wall_above_mirrors_the_wall_below(law: str) -> None:
+    common = {"wall.law": law, "wall.damping_nm_s_per_rad": 0.1, "limits.torque_nm": 0.4}
+    below = Wall(common | {"wall.side": "below", "wall.position_rad": 0.0301})
+    above = Wall(common | {"wall.side": "above", "wall.position_rad": -0.0301})
+    for wall, sign in ((below, 1), (above, -1)):
+        start_at(wall.cycle, sign * 60)
+    forces = set()
+    for counts in strike():
+        assert below.at(int(counts)) == -above.at(-int(counts))
+        for same in ("y", "y_est", "v_est", "d_est", "force", "force_applied"):
+            assert below.row[same][0] == above.row[same][0], same
+        for opposite in ("position_rad", "torque_cmd", "torque_applied", "wall_position_rad"):
+            assert below.row[opposite][0] == -above.row[opposite][0], opposite
+        forces.add(below.torque())
+    assert max(forces) == 400  # into the limit, and back out
+    assert len(forces) > 5
+
+
+def test_wall_is_changed_between_two_cycles() -> None:
+    wall = Wall({"wall.law": "standard", "wall.stiffness_nm_per_rad": 50.0})
+    wall.at(0)
+    assert wall.at(-10) == 500
+    estimate = wall.cycle["estimator"].copy()
+    stiffer = wall.settings.wall.model_copy(
+        update={"stiffness_nm_per_rad": 20.0, "position_rad": 0.005}
+    )
+    set_wall(wall.cycle, stiffer, wall.laws)
+    assert wall.cycle["estimator"] == estimate
+    assert wall.at(-10) == 300
+    assert wall.row["y"][0] == pytest.approx(-0.015)
+    assert wall.row["stiffness"][0] == 20.0
+
+
+def test_another_law_starts_without_memories() -> None:
+    wall = Wall()
+    assert [law.name for law in wall.laws] == ["standard", "half_sample"]
+    wall.cycle["wall"]["memory"] = 7.0
+    set_wall(wall.cycle, wall.settings.wall, wall.laws)
+    assert wall.cycle["wall"]["memory"][0, 0, 0] == 7.0
+    other = wall.settings.wall.model_copy(update={"law": "half_sample"})
+    set_wall(wall.cycle, other, wall.laws)
+    assert wall.cycle["law"][0] == 1
+    assert not wall.cycle["wall"]["memory"].any()
+
+
+def test_law_that_nobody_knows() -> None:
+    wall = Wall()
+    with pytest.raises(UnknownLawError):
+        set_wall(wall.cycle, wall.settings.wall.model_copy(update={"law": "none"}), wall.laws)
+
+
+def test_estimator_that_cannot_be() -> None:
+    with pytest.raises(ConfigError, match=r"^estimator.force_walk_nm_per_sqrt_s: "):
+        Wall({"estimator.force_walk_nm_per_sqrt_s": 1e30})

@@ -1,0 +1,137 @@
+"""One thread for everything on the bus: SDO, EMCY and the frames of others, among one another."""
+
+import logging
+import struct
+
+import can
+import pytest
+from rig import SDO_ANSWER, Rig, RigFactory
+
+from canwall.drive import DriveError, Link
+
+
+@pytest.fixture
+def rig(make_rig: RigFactory) -> Rig:
+    return make_rig()
+
+
+def answer(index: int, value: int) -> bytes:
+    """An expedited upload response of four bytes."""
+    return struct.pack("<BHBL", 0x43, index, 0, value)
+
+
+def from_the_drive(rig: Rig, can_id: int, data: bytes, **kinds: bool) -> None:
+    rig.drive_bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False, **kinds))
+
+
+# SDO
+
+
+def test_answers_that_come_too_late_answer_nothing(rig: Rig) -> None:
+    for value in (1, 2, 3):
+        from_the_drive(rig, SDO_ANSWER, answer(0x6041, value))
+    assert rig.node.read(0x1000) == 0x20192
+
+
+def test_late_answer_after_the_request(make_rig: RigFactory) -> None:
+    rig = make_rig()
+    process = rig.tampering.process
+
+    def late(can_id: int, data: bytes) -> list[tuple[int, bytes]]:
+        return [(SDO_ANSWER, answer(0x6041, 7)), *process(can_id, data)]
+
+    rig.tampering.process = late  # type: ignore[method-assign]
+    assert rig.node.read(0x1000) == 0x20192
+    rig.node.write_confirmed(0x6071, 0, -5)
+
+
+def test_other_frames_do_not_disturb(rig: Rig) -> None:
+    for data in (b"", b"\x01", bytes(8)):
+        for can_id in (0x000, 0x080, 0x085, 0x123, 0x185, 0x585, 0x705):
+            from_the_drive(rig, can_id, data)
+    assert rig.node.read(0x1000) == 0x20192
+
+
+@pytest.mark.parametrize("data", [b"", b"\x43", answer(0x1000, 1)[:4]])
+def test_frame_too_short_for_an_sdo_is_no_answer(rig: Rig, data: bytes) -> None:
+    from_the_drive(rig, SDO_ANSWER, data)
+    assert rig.node.read(0x1000) == 0x20192
+
+
+def test_segmented_answer(rig: Rig) -> None:
+    name = rig.node.read(0x1008)
+    assert name.to_bytes(29, "little") == b"canwall simulated servo drive"
+
+
+def test_negative_numbers(rig: Rig) -> None:
+    rig.node.write(0x6071, 0, -1)
+    assert rig.node.read(0x6071) == -1
+
+
+def test_failures_are_not_logged_as_well(
+    rig: Rig, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])  # as in a program, not as in pytest
+    rig.tampering.mute.add(SDO_ANSWER)
+    with pytest.raises(DriveError):
+        rig.node.read(0x1000)
+    assert capfd.readouterr().err == ""
+
+
+# EMCY
+
+
+def test_emergencies_reach_the_node(rig: Rig) -> None:
+    assert rig.node.emergencies == []
+    for code in (0x2310, 0x0000, 0x8130):
+        from_the_drive(rig, 0x085, struct.pack("<HB5s", code, 0x11, bytes(5)))
+    while rig.link.serve(0.0):
+        pass
+    assert [emergency.code for emergency in rig.node.emergencies] == [0x2310, 0x0000, 0x8130]
+
+
+# Frames
+
+
+def test_remote_and_error_frames_are_ignored(rig: Rig) -> None:
+    from_the_drive(rig, SDO_ANSWER, b"", is_remote_frame=True)
+    from_the_drive(rig, SDO_ANSWER, answer(0x1000, 1), is_error_frame=True)
+    assert rig.node.read(0x1000) == 0x20192
+    from_the_drive(rig, 0x185, b"", is_remote_frame=True)
+    from_the_drive(rig, 0x185, b"late", is_error_frame=True)
+    from_the_drive(rig, 0x185, b"data")
+    message = rig.link.wait_for(0x185, 1.0)
+    assert message is not None
+    assert bytes(message.data) == b"data"
+
+
+def test_wait_for_hands_the_rest_to_the_network(rig: Rig) -> None:
+    from_the_drive(rig, 0x085, struct.pack("<HB5s", 0x4210, 1, bytes(5)))
+    from_the_drive(rig, 0x185, b"mine")
+    from_the_drive(rig, 0x285, b"next")
+    assert rig.link.wait_for(0x185, 1.0) is not None
+    assert len(rig.node.emergencies) == 1
+    message = rig.link.receive(0.0)
+    assert message is not None
+    assert message.arbitration_id == 0x285
+    assert rig.link.wait_for(0x185, 0.0) is None
+
+
+def test_everything_is_noted(rig: Rig) -> None:
+    rig.node.read(0x1000)
+    assert rig.frames == [
+        (0x605, b"\x40\x00\x10\x00\0\0\0\0"),
+        (0x705, b"\0"),
+        (0x585, answer(0x1000, 0x20192)),
+    ]
+
+
+def test_without_idle_the_bus_is_waited_on(rig: Rig) -> None:
+    link = Link(rig.bus)
+    assert link.receive(0.0) is not None  # boot-up
+    assert link.receive(0.001) is None
+    from_the_drive(rig, 0x185, b"here")
+    assert link.serve(1.0)
+    link.close()
+    with pytest.raises(can.CanOperationError):
+        link.receive(0.0)

@@ -1,0 +1,322 @@
+"""The ring, the writer process and the folder: what was put in comes out, whoever dies."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import can
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from canwall.config import ConfigError
+from canwall.record import ROW, RecordError, Recorder, Ring, RunFolder, read_signals
+from canwall.record.ring import FRAMES, ROWS, put_frame, put_row, to_message
+from canwall.record.writer import schema
+
+LAWS = ["standard", "half_sample"]
+PATIENCE_S = 30.0
+
+
+def some_rows(count: int) -> NDArray[np.void]:
+    """Rows that differ in every column, law and flags within their range."""
+    rows = np.zeros(count, ROW)
+    for place, name in enumerate(ROW.names or ()):
+        rows[name] = (np.arange(count) * 7 + place) % 101
+    rows["j"] = np.arange(count)
+    rows["law"] %= len(LAWS)
+    return rows
+
+
+def put_rows(ring: Ring, rows: NDArray[np.void]) -> None:
+    for j in range(len(rows)):
+        put_row(ring.header, ring.rows, rows[j : j + 1])
+
+
+def some_frames(count: int) -> list[can.Message]:
+    frames = [
+        can.Message(
+            timestamp=1_700_000_000.0 + number / 1000,
+            arbitration_id=0x181 + number % 5,
+            is_extended_id=False,
+            is_rx=bool(number % 2),
+            data=number.to_bytes(4, "little")[: number % 5],
+        )
+        for number in range(count)
+    ]
+    return [
+        *frames,
+        can.Message(timestamp=1.8e9, arbitration_id=0x12345678, data=b"\xff" * 8),
+        can.Message(timestamp=1.8e9, arbitration_id=0x702, is_extended_id=False, dlc=0),
+    ]
+
+
+def log(ring: Ring, frames: list[can.Message]) -> None:
+    for frame in frames:
+        ring.log_frame(frame.timestamp, frame, frame.is_rx)
+
+
+def assert_rows(table: pa.Table, rows: NDArray[np.void]) -> None:
+    assert table.column_names == list(ROW.names or ())
+    for name in table.column_names:
+        if name == "law":
+            assert table[name].to_pylist() == [LAWS[law] for law in rows["law"]]
+        else:
+            assert table[name].to_numpy().tolist() == rows[name].tolist()
+
+
+def wait_until_written(ring: Ring) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while ring.backlog() > 0.0:
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+# Ring
+
+
+@st.composite
+def messages(draw: st.DrawFn) -> can.Message:
+    extended = draw(st.booleans())
+    remote = draw(st.booleans())
+    return can.Message(
+        arbitration_id=draw(st.integers(0, 0x1FFFFFFF if extended else 0x7FF)),
+        is_extended_id=extended,
+        is_remote_frame=remote,
+        is_error_frame=draw(st.booleans()) and not remote,
+        is_rx=draw(st.booleans()),
+        dlc=draw(st.integers(0, 8)) if remote else None,
+        data=None if remote else draw(st.binary(max_size=8)),
+    )
+
+
+RING = Ring.create()
+
+
+@settings(deadline=None, max_examples=100)
+@given(sent=st.lists(messages(), max_size=5))
+def test_frames_come_out_as_they_went_in(sent: list[can.Message]) -> None:
+    for number, message in enumerate(sent):
+        RING.log_frame(float(number), message, message.is_rx)
+    taken = RING.take_frames()
+    assert [frame["time_s"] for frame in taken] == [float(n) for n in range(len(sent))]
+    for frame, message in zip(taken, sent, strict=True):
+        assert to_message(frame, "bus").equals(message, timestamp_delta=None, check_channel=False)
+
+
+def test_rows_come_out_in_order_past_the_end_of_the_ring() -> None:
+    ring = Ring.create()
+    rows = some_rows(ROWS)
+    for start in range(0, 3 * ROWS, 5000):
+        part = rows[np.arange(start, start + 5000) % ROWS]
+        put_rows(ring, part)
+        assert (ring.take_rows() == part).all()
+    assert len(ring.take_rows()) == 0
+    assert ring.header["rows_lost"][0] == 0
+
+
+def test_two_views_of_one_ring() -> None:
+    ring = Ring.create()
+    other = Ring(ring.descriptor)
+    put_rows(ring, some_rows(3))
+    assert len(other.take_rows()) == 3
+    assert ring.backlog() == 0.0
+
+
+def test_backlog_is_that_of_the_fuller_ring() -> None:
+    ring = Ring.create()
+    put_rows(ring, some_rows(ROWS // 4))
+    assert ring.backlog() == 0.25
+    ring.header["frame_head"] = FRAMES // 2
+    assert ring.backlog() == 0.5
+
+
+def test_full_ring_counts_what_it_loses() -> None:
+    ring = Ring.create()
+    rows = some_rows(ROWS)
+    put_rows(ring, rows)
+    put_rows(ring, rows[:3])
+    for _ in range(FRAMES + 2):
+        put_frame(ring.header, ring.frames, 0.0, 0x181, 0, 0, 0)
+    assert ring.header["rows_lost"][0] == 3
+    assert ring.header["frames_lost"][0] == 2
+    assert (ring.take_rows() == rows).all()
+    put_rows(ring, rows[:1])
+    assert len(ring.take_rows()) == 1
+
+
+# Writer
+
+
+@pytest.mark.parametrize("bus_log", ["bus.log", "bus.asc", "bus.blf"])
+def test_round_trip_through_the_writer(tmp_path: Path, bus_log: str) -> None:
+    recorder = Recorder(tmp_path, bus_log, "canwall", LAWS)
+    rows, frames = some_rows(20_000), some_frames(500)  # more than one row group
+    for start in range(0, len(rows), 5000):
+        put_rows(recorder.ring, rows[start : start + 5000])
+        wait_until_written(recorder.ring)
+    log(recorder.ring, frames)
+    assert recorder.close() == []
+    table = read_signals(tmp_path / "signals.parquet")
+    assert_rows(table, rows)
+    assert table.schema.metadata[b"laws"] == json.dumps(LAWS).encode()
+    with can.LogReader(tmp_path / bus_log) as reader:
+        read = list(reader)
+    assert len(read) == len(frames)
+    for message, frame in zip(read, frames, strict=True):
+        assert message.equals(frame, timestamp_delta=None, check_channel=False)
+        # .asc is read back as time since its beginning.
+        since = message.timestamp - read[0].timestamp
+        assert since == pytest.approx(frame.timestamp - frames[0].timestamp, abs=0.002)
+
+
+def test_empty_record(tmp_path: Path) -> None:
+    assert Recorder(tmp_path, "bus.log", "canwall", LAWS).close() == []
+    table = read_signals(tmp_path / "signals.parquet")
+    assert table.num_rows == 0
+    assert table.schema.equals(schema(LAWS))
+    assert (tmp_path / "bus.log").read_text() == ""
+
+
+def test_what_was_lost_is_reported(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path, "bus.log", "canwall", LAWS)
+    recorder.ring.header["rows_lost"] = 7
+    recorder.ring.header["frames_lost"] = 9
+    assert recorder.close() == [
+        f"{tmp_path}: 7 rows lost: the disk was too slow",
+        f"{tmp_path}: 9 frames lost: the disk was too slow",
+    ]
+
+
+def test_folder_that_cannot_be_written(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "nowhere", "bus.log", "canwall", LAWS)
+    put_rows(recorder.ring, some_rows(10))
+    wait_until_written(recorder.ring)  # emptied all the same
+    (note,) = recorder.close()
+    assert "the record is incomplete" in note
+    assert "\n" not in note
+
+
+def test_writer_that_dies(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path, "bus.log", "canwall", LAWS)
+    recorder._writer.kill()
+    (note,) = recorder.close()
+    assert "the writer of the record did not finish" in note
+
+
+def test_writer_that_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "no-python"))
+    with pytest.raises(RecordError, match="does not start"):
+        Recorder(tmp_path, "bus.log", "canwall", LAWS)
+
+
+# A master that ends otherwise
+
+MASTER = """
+import os, signal, sys, time
+from pathlib import Path
+from test_record import LAWS, log, put_rows, some_frames, some_rows
+from canwall.record import Recorder
+
+signal.signal(signal.SIGINT, lambda number, frame: None)
+recorder = Recorder(Path(sys.argv[1]), "bus.log", "canwall", LAWS)
+if sys.argv[2] == "ctrl-c":
+    os.killpg(0, signal.SIGINT)  # as a terminal does: to master and writer, here a starting one
+put_rows(recorder.ring, some_rows(3000))
+log(recorder.ring, some_frames(3000))
+if sys.argv[2] == "ctrl-c":
+    sys.exit(bool(recorder.close()))
+print("recorded", flush=True)
+time.sleep(60)
+"""
+
+
+def master(folder: Path, what: str) -> "subprocess.Popen[str]":
+    return subprocess.Popen(
+        [sys.executable, "-c", MASTER, str(folder), what],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
+    )
+
+
+def test_killed_master_leaves_a_complete_record(tmp_path: Path) -> None:
+    with master(tmp_path, "kill") as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert process.stdout.readline() == "recorded\n"
+        os.kill(process.pid, signal.SIGKILL)
+        # The writer has the master's stderr, and ends when the record is complete.
+        assert process.stderr.read() == ""
+    assert_rows(read_signals(tmp_path / "signals.parquet"), some_rows(3000))
+    with can.LogReader(tmp_path / "bus.log") as reader:
+        assert len(list(reader)) == len(some_frames(3000))
+
+
+def test_ctrl_c_does_not_end_the_writer(tmp_path: Path) -> None:
+    with master(tmp_path, "ctrl-c") as process:
+        assert process.wait(PATIENCE_S) == 0
+    assert read_signals(tmp_path / "signals.parquet").num_rows == 3000
+
+
+# Folder
+
+
+def test_folder_is_made_with_its_parents(tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path / "a" / "b")
+    assert folder.path.is_dir()
+    assert list(folder.path.iterdir()) == []
+    assert {p.name for p in (folder.signals, folder.summary, folder.config, folder.picture)} == {
+        "signals.parquet",
+        "summary.json",
+        "config.toml",
+        "run.png",
+    }
+
+
+def test_folder_of_its_own_for_every_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    first, second = RunFolder.create(None), RunFolder.create(None)
+    assert first.path.parent == Path("runs")
+    assert first.path != second.path
+
+
+def test_folder_that_holds_a_run_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "signals.parquet").write_text("a thesis")
+    with pytest.raises(ConfigError, match="holds a run already; choose another --output"):
+        RunFolder.create(tmp_path)
+    assert (tmp_path / "signals.parquet").read_text() == "a thesis"
+
+
+@pytest.mark.parametrize("where", ["file", "file/below", "/proc/canwall"])
+def test_folder_that_cannot_be_made(tmp_path: Path, where: str) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="cannot be written: .*; choose another --output"):
+        RunFolder.create(tmp_path / where)
+
+
+def test_what_is_no_record(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    with pytest.raises(ConfigError, match="no such file; give the folder of a run"):
+        read_signals(folder.signals)
+    folder.signals.write_text("PAR1 or not")
+    with pytest.raises(ConfigError, match="not a record of a run"):
+        read_signals(folder.signals)
+    pq.write_table(pa.table({"j": [1, 2]}), folder.signals)
+    with pytest.raises(ConfigError, match="not a record of a run: lacks column t_s, phase"):
+        read_signals(folder.signals)
+    with pytest.raises(ConfigError, match="not a summary of a run"):
+        folder.read_summary()
+    folder.summary.write_text("{")
+    with pytest.raises(ConfigError, match="not a summary of a run"):
+        folder.read_summary()

@@ -1,0 +1,170 @@
+"""A simulated drive and its master on one virtual bus, in one thread: what several tests need."""
+
+import itertools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeAlias, cast
+
+import can
+import numpy as np
+from can.interfaces.virtual import VirtualBus
+from numpy.typing import NDArray
+
+from canwall import config, simdrive
+from canwall.config import Settings
+from canwall.cycle import Change, Outcome, PythonCanExchange, make_cycle, run_loop
+from canwall.drive import REQUIRED_OBJECTS, DriveNode, DriveSetup, Link, set_up
+from canwall.eds import load_eds
+from canwall.record import Ring
+from canwall.run import run_laws
+
+SIM_CONFIG = config.shipped("config/sim.toml")
+SYNC, TPDO1, RPDO1, SDO_REQUEST, SDO_ANSWER = 0x080, 0x185, 0x205, 0x605, 0x585
+
+Object: TypeAlias = tuple[int, int]
+"""Index and subindex."""
+
+RigFactory: TypeAlias = Callable[..., "Rig"]
+"""Makes a rig that is closed at the end of the test; arguments as Rig."""
+
+_channels = itertools.count()
+
+
+def settings_with(overrides: Mapping[str, Any] | None = None) -> Settings:
+    """config/sim.toml with other values under dotted keys."""
+    return config.load(SIM_CONFIG, overrides)
+
+
+def multiplexer(data: bytes) -> Object:
+    """Index and subindex of an SDO's first request or answer."""
+    return int.from_bytes(data[1:3], "little"), data[3]
+
+
+@dataclass
+class Tampering:
+    """Stands between the bus and a drive, so that tests have drives that misbehave."""
+
+    drive: simdrive.SimulatedDrive
+    #: Values that uploads give instead of the drive's own.
+    lies: dict[Object, int] = field(default_factory=dict)
+    #: Abort codes that requests for these objects get.
+    aborts: dict[Object, int] = field(default_factory=dict)
+    #: CAN-IDs that the drive does not hear, and those that it does not send.
+    deaf: set[int] = field(default_factory=set)
+    mute: set[int] = field(default_factory=set)
+
+    def boot(self) -> list[simdrive.Frame]:
+        return self._out(self.drive.boot())
+
+    def tick(self, dt: float) -> list[simdrive.Frame]:
+        return self._out(self.drive.tick(dt))
+
+    def process(self, can_id: int, data: bytes) -> list[simdrive.Frame]:
+        if can_id in self.deaf:
+            return []
+        if can_id == SDO_REQUEST and multiplexer(data) in self.aborts:
+            code = self.aborts[multiplexer(data)]
+            return [(SDO_ANSWER, b"\x80" + data[1:4] + code.to_bytes(4, "little"))]
+        return self._out(self.drive.process(can_id, data))
+
+    def _out(self, frames: list[simdrive.Frame]) -> list[simdrive.Frame]:
+        return [(i, self._lied(i, data)) for i, data in frames if i not in self.mute]
+
+    def _lied(self, can_id: int, data: bytes) -> bytes:
+        if can_id == SDO_ANSWER and data[0] >> 5 == 2 and multiplexer(data) in self.lies:
+            return data[:4] + self.lies[multiplexer(data)].to_bytes(4, "little")
+        return data
+
+
+class Rig:
+    """Drive, bus and master; `frames` is every frame that the master sent and received."""
+
+    def __init__(
+        self, settings: Settings | None = None, bus: Callable[[str], can.BusABC] = VirtualBus
+    ) -> None:
+        self.settings = settings or settings_with()
+        assert self.settings.simulation is not None
+        channel = f"rig {next(_channels)}"
+        self.bus = bus(channel)
+        self.drive_bus = VirtualBus(channel)
+        self.tampering = Tampering(
+            simdrive.make_drive(
+                self.settings.drive, self.settings.simulation, self.settings.bus.cycle_s
+            )
+        )
+        drive = cast(simdrive.SimulatedDrive, self.tampering)
+        self.runner = simdrive.BusRunner(drive, self.drive_bus)
+        self.link = Link(self.bus, idle=self.runner.poll)
+        self.link.log = self._note
+        self.frames: list[tuple[int, bytes]] = []
+        dictionary = load_eds(self.settings.drive.eds, 5, REQUIRED_OBJECTS)
+        self.node = DriveNode(self.link, 5, dictionary)
+
+    def _note(self, time_s: float, message: can.Message, received: bool) -> None:
+        self.frames.append((message.arbitration_id, bytes(message.data)))
+
+    def close(self) -> None:
+        self.bus.shutdown()
+        self.drive_bus.shutdown()
+
+    def set_up(self) -> DriveSetup:
+        return set_up(self.node, self.settings.drive)
+
+    def inject(self, can_id: int, data: bytes) -> None:
+        """A frame of somebody else, for master and drive."""
+        self.drive_bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+        self.bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+
+    def rpdos(self) -> list[tuple[int, int]]:
+        """Controlword and target torque of each RPDO so far."""
+        return [
+            (int.from_bytes(data[:2], "little"), int.from_bytes(data[2:4], "little", signed=True))
+            for can_id, data in self.frames
+            if can_id == RPDO1
+        ]
+
+
+class Loop:
+    """What `canwall run` builds around a drive that is set up, on a rig, without a writer."""
+
+    def __init__(self, rig: Rig, real_time: bool = False) -> None:
+        self.rig = rig
+        self.laws = run_laws(rig.settings)
+        self.setup = rig.set_up()
+        self.record = make_cycle(rig.settings, self.setup, self.laws)
+        self.ring = Ring.create()
+        self.exchange = PythonCanExchange(rig.link, self.setup, self.record, self.ring, real_time)
+
+    def run(
+        self,
+        cycles: int | None,
+        stop: Callable[[int], bool] = lambda j: False,
+        changes: list[Change] | None = None,
+    ) -> Outcome:
+        """`stop` is asked once a cycle, with the cycle: a place to do things as well."""
+        return run_loop(
+            self.exchange,
+            self.record,
+            self.rig.node,
+            self.laws,
+            changes or [],
+            cycles,
+            lambda: stop(int(self.record["j"][0])),
+        )
+
+    def rows(self) -> NDArray[np.void]:
+        """One row per cycle so far."""
+        return self.ring.take_rows()
+
+
+def eds_without(path: Path, *sections: str) -> Path:
+    """The drive's EDS without some objects: names of sections, e.g. "6064"."""
+    kept, keep = [], True
+    for line in (SIM_CONFIG.parent.parent / "eds" / "canwall-drive.eds").read_text().splitlines():
+        if line.startswith("["):
+            keep = line.strip("[]").split("sub")[0] not in sections
+        if keep:
+            kept.append(line)
+    path.write_text("\n".join(kept))
+    return path

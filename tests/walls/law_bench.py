@@ -1,0 +1,93 @@
+"""One wall and one law on a bench: what the tests of the laws share."""
+
+import math
+
+import numpy as np
+from bouncing import Array
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from canwall.walls import (
+    LAWS,
+    TENSION,
+    WALL,
+    note_force,
+    set_plant,
+    set_referent,
+    wall_force,
+)
+from canwall.walls.interface import free_step
+from canwall.workbench import Ball
+
+PREDICTING = ("half_sample", "midpoint", "pole_placement")
+COMPENSATED = ("half_sample+deadbeat", "pole_placement+deadbeat")
+
+
+def wall_of(ball: Ball, law: str, passivity: float = 0.0, **options: float) -> NDArray[np.void]:
+    """The WALL record of a ball on its floor."""
+    wall = np.zeros(1, WALL)
+    set_plant(wall, ball.mass, ball.viscous, ball.spring, ball.period)
+    set_referent(wall, ball.stiffness, ball.damping, LAWS[law].option_values(options))
+    wall["tension"] = TENSION[ball.tension]
+    wall["passivity_damping"] = passivity
+    wall["d"] = -ball.mass * ball.gravity
+    return wall
+
+
+def force_at(wall: NDArray[np.void], law: str, y: float, v: float) -> float:
+    """Force of a law for the state at actuation; the sample, another one, would give none."""
+    wall["y_sample"], wall["v_sample"] = 1.0, 77.0
+    wall["y"], wall["v"] = y, v
+    return wall_force(LAWS[law].address, wall[0])
+
+
+def force_at_sample(wall: NDArray[np.void], law: str, y: float, v: float) -> float:
+    """Force of a law for a sample; the state at actuation, another one, would give none."""
+    wall["y"], wall["v"] = 1.0, 77.0
+    wall["y_sample"], wall["v_sample"] = y, v
+    return wall_force(LAWS[law].address, wall[0])
+
+
+def played(ball: Ball, wall: NDArray[np.void], law: str) -> tuple[Array, Array, Array, Array]:
+    """(y, ẏ, f, absorbed) of a ball, in Python, with what the layers saw before each force."""
+    y, v = ball.height, ball.speed
+    states, forces, books = [(y, v)], [], []
+    address = LAWS[law].address
+    for _ in range(ball.periods):
+        wall["v_sample"] = (y - states[-2][0]) / ball.period if len(states) > 1 else v
+        wall["y"], wall["v"], wall["y_sample"] = y, v, y
+        forces.append(wall_force(address, wall[0]))
+        books.append(float(wall["absorbed"][0]))
+        note_force(wall[0], forces[-1])
+        y, v = free_step(wall[0], y, v, forces[-1])
+        states.append((y, v))
+    positions, velocities = np.array(states).T
+    return positions, velocities, np.array(forces), np.array(books)
+
+
+def log_floats(low: float, high: float) -> st.SearchStrategy[float]:
+    """Positive numbers, every decade as likely."""
+    return st.floats(math.log10(low), math.log10(high)).map(lambda exponent: 10.0**exponent)
+
+
+def or_zero(numbers: st.SearchStrategy[float]) -> st.SearchStrategy[float]:
+    return st.just(0.0) | numbers
+
+
+@st.composite
+def balls(draw: st.DrawFn, damped: bool = True, hardest: float = 3.0) -> Ball:
+    """Any mass, period and wall up to θ = `hardest`, with b, k_h, B and gravity that matter."""
+    mass, period = draw(log_floats(1e-4, 1e2)), draw(log_floats(1e-4, 1.0))
+    theta = draw(log_floats(0.02, hardest))
+    rate = theta / period
+    return Ball(
+        stiffness=mass * rate**2,
+        damping=draw(or_zero(log_floats(1e-3, 1.5))) * 2.0 * mass * rate if damped else 0.0,
+        mass=mass,
+        viscous=draw(or_zero(log_floats(1e-3, 0.5))) * mass * rate if damped else 0.0,
+        spring=draw(or_zero(log_floats(1e-3, 1.0))) * mass * rate**2,
+        gravity=draw(or_zero(st.floats(-1.0, 1.0))) * rate**2,
+        height=1.0,
+        period=period,
+        periods=1,
+    )

@@ -1,0 +1,109 @@
+"""Laws by name, their options, and what they may not do: allocate."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from law_bench import COMPENSATED, wall_of
+from numba.core.runtime import _nrt_python, rtsys
+
+from canwall.walls import DEADBEAT, LAWS, Law, UnknownLawError, find_law
+from canwall.workbench import Ball
+from canwall.workbench.ball import bounce
+
+
+def test_every_law_of_the_theory_is_there() -> None:
+    assert list(LAWS) == [
+        "standard",
+        "damped",
+        "hysteresis",
+        "exponential",
+        "thresholded_damper",
+        "unidirectional_damper",
+        "offset_damper",
+        "half_sample",
+        "half_sample+deadbeat",
+        "pole_placement",
+        "pole_placement+deadbeat",
+        "midpoint",
+        "two_step",
+        "mean_force",
+        "push_only",
+        "rigid",
+    ]
+    for name, law in LAWS.items():
+        assert find_law(name) is law
+        assert law.name == name
+
+
+@pytest.mark.parametrize("law", [name for name in LAWS if not name.endswith(DEADBEAT)])
+def test_deadbeat_is_an_option_of_some_laws(law: str) -> None:
+    if law + DEADBEAT in COMPENSATED:
+        assert find_law(law, deadbeat=True) is LAWS[law + DEADBEAT]
+        return
+    with pytest.raises(UnknownLawError) as caught:
+        find_law(law, deadbeat=True)
+    assert str(caught.value) == (
+        f"law {law} has no deadbeat compensation; half_sample, pole_placement have"
+    )
+
+
+@pytest.mark.parametrize("name", ["Standard", "half-sample", "", "deadbeat"])
+@pytest.mark.parametrize("deadbeat", [False, True])
+def test_unknown_law(name: str, deadbeat: bool) -> None:
+    with pytest.raises(UnknownLawError, match=r"unknown law '.*'; known are standard, damped, "):
+        find_law(name, deadbeat)
+
+
+def test_options_have_defaults_and_names() -> None:
+    hysteresis = LAWS["hysteresis"]
+    assert hysteresis.option_values({}) == [0.8, 0.0]
+    assert hysteresis.option_values({"release": 0.01}) == [0.8, 0.01]
+    assert LAWS["standard"].option_values({}) == []
+    with pytest.raises(UnknownLawError, match="no option 'slope'; it has softening, release"):
+        hysteresis.option_values({"slope": 1.0})
+    with pytest.raises(UnknownLawError, match="law standard has no option 'slope'; it has none"):
+        LAWS["standard"].option_values({"slope": 1.0})
+
+
+@pytest.fixture
+def _counted_allocations() -> Iterator[None]:
+    was_on = _nrt_python.memsys_stats_enabled()
+    _nrt_python.memsys_enable_stats()
+    yield
+    if not was_on:
+        _nrt_python.memsys_disable_stats()
+
+
+def allocations(law: Law) -> int:
+    """What numba's runtime allocates while a ball bounces on a law."""
+    ball = Ball(stiffness=9.0, damping=0.1, viscous=0.01, spring=0.1, tension="budget")
+    wall = wall_of(ball, "standard", passivity=0.5)
+    wall["options"][0, : len(law.options)] = law.option_values({})
+    trajectory = np.zeros((3, 1000))
+    bounce(wall, law.address, 1.0, 0.0, trajectory)  # compiled by now
+    before = rtsys.get_allocation_stats()
+    bounce(wall, law.address, 1.0, 0.0, trajectory)
+    after = rtsys.get_allocation_stats()
+    assert np.any(trajectory[2] > 0.0)
+    return int(after.alloc - before.alloc + after.mi_alloc - before.mi_alloc)
+
+
+@pytest.mark.usefixtures("_counted_allocations")
+@pytest.mark.parametrize("law", LAWS)
+def test_no_law_allocates_in_the_cycle(law: str) -> None:
+    # An array that enters compiled code costs one reference, however long that runs.
+    assert allocations(LAWS[law]) <= 4
+
+
+@pytest.mark.usefixtures("_counted_allocations")
+def test_a_law_that_allocates_would_be_seen(tmp_path: Path) -> None:
+    (tmp_path / "wasteful.py").write_text(
+        "import numpy as np\n"
+        "def wasteful(wall):\n"
+        "    history = np.zeros(int(2.0 + wall.stiffness))\n"
+        "    history[0] = -wall.y\n"
+        "    return history.max()\n"
+    )
+    assert allocations(find_law(f"{tmp_path}/wasteful.py:wasteful")) > 900

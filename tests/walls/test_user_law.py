@@ -1,0 +1,184 @@
+"""A law in the user's own file: the documentation's example, and what can be wrong with one."""
+
+import runpy
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from bouncing import Array
+from commands import Record, command, config_file
+from rig import SIM_CONFIG
+
+from canwall.record import Phase
+from canwall.walls import LAWS, WALL, UnknownLawError, find_law, set_plant, set_referent, wall_force
+from canwall.workbench import Ball, bounced, sampled_ball
+
+EXAMPLE = Path(__file__).parents[2] / "docs" / "my_law.py"
+
+Write = Callable[[str], str]
+"""Writes a file with a law `mine`; returns the law's name."""
+
+
+@pytest.fixture
+def example(tmp_path: Path) -> str:
+    """Name of the example's law, in a copy of its own."""
+    return f"{shutil.copy(EXAMPLE, tmp_path)}:my_law"
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Write:
+    def written(text: str) -> str:
+        (tmp_path / "mine.py").write_text(text)
+        return f"{tmp_path}/mine.py:mine"
+
+    return written
+
+
+def stiffening(y: Array, v: Array, stiffness: float, growth: float, period: float) -> Array:
+    """The undamped example's formula."""
+    depth = np.maximum(-(y + 0.5 * period * v), 0.0)
+    return np.where(y < 0.0, stiffness * (depth + growth * depth**2), 0.0)
+
+
+def test_example_is_its_formula(example: str) -> None:
+    law = find_law(example)
+    wall = np.zeros(1, WALL)
+    set_plant(wall, mass=0.3, viscous=0.1, spring=0.0, period=0.01)
+    set_referent(wall, 40.0, 0.2, law.option_values({"growth": 3.0}))
+    interpreted = runpy.run_path(str(EXAMPLE))["my_law"]
+    for y, v in ((-0.1, -2.0), (-0.1, 2.0), (-0.001, 3.0), (0.0, -1.0), (0.1, -1.0)):
+        wall["y"], wall["v"] = y, v
+        force = wall_force(law.address, wall[0])
+        undamped = stiffening(np.array(y), np.array(v), 40.0, 3.0, 0.01)
+        assert force == pytest.approx(undamped - (0.2 * v if y < 0.0 else 0.0))
+        fields = {name: wall[name][0] for name in ("y", "v", "period", "stiffness", "damping")}
+        assert force == pytest.approx(interpreted(SimpleNamespace(**fields, options=[3.0])))
+
+
+def test_example_without_growth_is_the_clamped_midpoint(example: str) -> None:
+    own = bounced(Ball(stiffness=4.0), example, options={"growth": 0.0})
+    midpoint = sampled_ball(Ball(stiffness=4.0, tension="clamp"), LAWS["midpoint"])
+    for mine, theirs in zip(own, midpoint, strict=True):
+        assert mine[:100] == pytest.approx(theirs[:100], rel=1e-9, abs=1e-9)
+
+
+def test_ball_command_finds_the_file_from_where_it_is_called(example: str, tmp_path: Path) -> None:
+    for _start in ("compiled", "as compiled by the first"):
+        done = command(
+            *("ball", "--law", "my_law.py:my_law", "--option", "growth=2", "--stiffness", "4"),
+            *("--periods", "200", "--output", "ball.csv"),
+            cwd=tmp_path,
+        )
+        assert (done.returncode, done.stderr) == (0, "")
+    _, y, v, force = np.loadtxt(tmp_path / "ball.csv", delimiter=",", skiprows=1).T
+    expected = stiffening(y, v, 4.0, 2.0, 0.1)[:-1]
+    np.testing.assert_allclose(force[:-1], expected, rtol=0.0, atol=1e-12)
+    assert force.max() > 1.0
+
+
+def test_run_finds_the_file_beside_its_configuration(example: str, tmp_path: Path) -> None:
+    (tmp_path / "sim.toml").write_text(SIM_CONFIG.read_text().partition("[[schedule]]")[0])
+    config = config_file(
+        tmp_path / "mine.toml",
+        {
+            'law = "standard"': 'law = "my_law.py:my_law"',
+            "[estimator]": "[wall.options]\ngrowth = 2.5\n\n[estimator]",
+            "duration_s = 4.2": "duration_s = 0.6",
+        },
+        source=tmp_path / "sim.toml",
+    )
+    done = command("run", config, "--output", tmp_path / "run", cwd=Path("/"))
+    assert (done.returncode, done.stderr) == (0, "")
+    record = Record(tmp_path / "run")
+    assert record.summary["law"] == [example]
+    rendering = record.column("phase") == Phase.RENDERING
+    y, v = record.column("y_est")[rendering], record.column("v_est")[rendering]
+    expected = stiffening(y, v, 50.0, 2.5, 0.001)
+    assert expected.max() > 0.01
+    np.testing.assert_allclose(record.column("force")[rendering], expected, rtol=1e-9, atol=1e-12)
+
+
+def test_options_of_an_own_law(example: str) -> None:
+    law = find_law(example)
+    assert law.option_values({}) == [5.0]
+    assert law.option_values({"growth": 0.5}) == [0.5]
+    with pytest.raises(UnknownLawError, match=r"my_law has no option 'grwth'; it has growth"):
+        law.option_values({"grwth": 1.0})
+
+
+def test_helpers_constants_memory_and_plain_integers(write: Write) -> None:
+    law = write(
+        "from canwall.compiled import compiled\n"
+        "LIMIT = 0.5\n"
+        "@compiled\n"
+        "def limited(x):\n"
+        "    return min(x, LIMIT)\n"
+        "def mine(wall):\n"
+        "    wall.memory[0] += 1\n"
+        "    if wall.y >= 0:\n"
+        "        return 0\n"
+        "    return limited(-wall.stiffness * wall.y) + 0.001 * wall.memory[0]\n"
+    )
+    y, _, force = bounced(Ball(periods=100), law)
+    calls = 0.001 * (np.arange(100) + 1.0)
+    expected = np.where(y < 0.0, np.minimum(-y, 0.5), 0.0)[:-1] + np.where(y[:-1] < 0.0, calls, 0.0)
+    np.testing.assert_allclose(force[:-1], expected, rtol=1e-12, atol=0.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("def other(wall):\n    return 0.0\n", "the file has no such function"),
+        ("def mine(wall)\n    return 0.0\n", "SyntaxError: expected ':' (mine.py, line 1)"),
+        ("import nowhere\n", "ModuleNotFoundError: No module named 'nowhere'"),
+        ("def mine(wall):\n    pass\n", "does not compile: No conversion from none to float64"),
+        ("def mine(wall):\n    return 'a'\n", "does not compile: "),
+        (
+            "def helper(x):\n    return x\ndef mine(wall):\n    return helper(wall.y)\n",
+            "does not compile: Untyped global name 'helper'",
+        ),
+        ("def mine(wall):\n    return wall.stifness\n", "KeyError: 'stifness'"),
+        ("def mine(wall, y):\n    return y\n", "TypeError: Signature mismatch: 1 argument"),
+        (
+            "OPTIONS = dict(a=1, b=2, c=3, d=4, e=5)\ndef mine(wall):\n    return 0.0\n",
+            "5 options; a law may have 4",
+        ),
+    ],
+)
+def test_one_line_for_what_is_wrong(write: Write, text: str, complaint: str) -> None:
+    name = write(text)
+    with pytest.raises(UnknownLawError) as caught:
+        find_law(name)
+    message = str(caught.value)
+    assert message.startswith(f"{name}: {complaint}")
+    assert "\n" not in message
+
+
+def test_one_line_for_a_file_that_is_not_there(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("def mine(wall):\n    return 0.0\n")
+    for file, complaint in (
+        (tmp_path / "mine.py", "no such file"),
+        (tmp_path, "no such file"),
+        (tmp_path / "mine.txt", "not a Python file"),
+    ):
+        with pytest.raises(UnknownLawError) as caught:
+            find_law(f"{file}:mine")
+        assert str(caught.value) == f"{file}:mine: {complaint}"
+
+
+def test_own_law_has_no_deadbeat(write: Write) -> None:
+    with pytest.raises(UnknownLawError):
+        find_law(write("def mine(wall):\n    return 0.0\n"), deadbeat=True)
+
+
+def test_run_says_it_in_one_line(write: Write, tmp_path: Path) -> None:
+    law = write("def mine(wall):\n    pass\n")
+    done = command("run", "--law", law, "--output", tmp_path / "run")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("canwall: ")
+    assert f"{law}: does not compile: No conversion from none" in line
+    assert done.returncode == 2
+    assert not (tmp_path / "run").exists()
