@@ -131,6 +131,7 @@ def ball(
     periods: Annotated[int, typer.Option(help="How many periods.")] = 3000,
     deadbeat: Annotated[bool, typer.Option("--deadbeat", help="Add the compensation.")] = False,
     tension: Annotated[str, typer.Option(help="allow, clamp or budget.")] = "allow",
+    passivity: Annotated[float, typer.Option(help="Passivity controller's damping.")] = 0.0,
     option: Annotated[list[str] | None, typer.Option(help="Law's option, NAME=VALUE.")] = None,
 ) -> int:
     """A ball bouncing on a floor that is the wall: exact state, no delay, held force."""
@@ -148,6 +149,7 @@ def ball(
         period=period,
         periods=periods,
         tension=tension,
+        passivity=passivity,
     )
     if law == CONTINUOUS and (deadbeat or option):
         raise InputError("--law continuous is no law: it has no --deadbeat and no --option")

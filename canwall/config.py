@@ -35,7 +35,12 @@ class _Section(BaseModel):
 
 # TOML writes a whole number without a point: `cycle_s = 1` is meant as 1.0.
 def _number(value: object) -> object:
-    return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
+    if isinstance(value, bool) or not isinstance(value, int):
+        return value
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
 
 
 Number = Annotated[float, BeforeValidator(_number)]
@@ -142,7 +147,8 @@ class Hand(_Section):
     @model_validator(mode="after")
     def _strikes_fit(self) -> Self:
         lasts = self.approach_s + self.press_s + self.withdraw_s
-        if self.strikes > 1 and lasts > self.interval_s:
+        # Strikes may follow one another without a rest: 0.1 + 0.1 + 0.1 fits into 0.3.
+        if self.strikes > 1 and lasts > self.interval_s * (1.0 + 1e-9):
             raise ValueError(
                 f"a strike lasts {lasts:g} s (approach_s + press_s + withdraw_s) and does not fit "
                 f"into interval_s = {self.interval_s:g}"
@@ -204,11 +210,13 @@ class Settings(_Section):
         if [c.at_s for c in self.schedule] != sorted(c.at_s for c in self.schedule):
             raise ValueError("schedule: the entries have to be in the order of at_s")
         low, high = self.limits.position_rad
-        if not low < self.wall.position_rad < high:
-            raise ValueError(
-                f"wall.position_rad = {self.wall.position_rad:g} lies outside "
-                f"limits.position_rad = [{low:g}, {high:g}]"
-            )
+        sections = ("wall", *(f"schedule.{i}" for i in range(len(self.schedule))))
+        for section, (_, wall) in zip(sections, self.walls, strict=True):
+            if not low < wall.position_rad < high:
+                raise ValueError(
+                    f"{section}.position_rad = {wall.position_rad:g} lies outside "
+                    f"limits.position_rad = [{low:g}, {high:g}]"
+                )
         return self
 
     @property
@@ -251,16 +259,25 @@ _AT_THE_HANDLE = {
 
 
 def _at_the_shaft(raw: dict[str, Any]) -> None:
-    radius = raw.get("mechanics", {}).get("handle_radius_m")
+    """Turn what is written at the handle; what is of the wrong type is left to the validation."""
+    mechanics, schedule = raw.get("mechanics"), raw.get("schedule")
+    radius = mechanics.get("handle_radius_m") if isinstance(mechanics, dict) else None
     if not isinstance(radius, int | float) or not radius > 0:
         return
-    for section in (raw.get("wall", {}), *raw.get("schedule", [])):
+    changes = schedule if isinstance(schedule, list) else []
+    sections = {"wall": raw.get("wall")} | {f"schedule.{i}": c for i, c in enumerate(changes)}
+    for name, section in sections.items():
+        if not isinstance(section, dict):
+            continue
         for metric, (angular, exponent) in _AT_THE_HANDLE.items():
             if metric not in section:
                 continue
             if angular in section:
-                raise ConfigError(f"wall.{metric}: {angular} is given as well; keep one of them")
-            section[angular] = section.pop(metric) * float(radius) ** exponent
+                raise ConfigError(f"{name}.{metric}: {angular} is given as well; keep one of them")
+            value = section.pop(metric)
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise ConfigError(f"{name}.{metric}: has to be a valid number, not {_shown(value)}")
+            section[angular] = value * float(radius) ** exponent
 
 
 def load(path: Path, overrides: Mapping[str, Any] | None = None) -> Settings:
@@ -276,20 +293,20 @@ def load(path: Path, overrides: Mapping[str, Any] | None = None) -> Settings:
         raise ConfigError(f"{path}: cannot be read: {error}") from None
     try:
         raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from None
-    for dotted, value in (overrides or {}).items():
-        section, key = dotted.split(".")
-        raw.setdefault(section, {})[key] = value
     try:
         _at_the_shaft(raw)
+        for dotted, value in (overrides or {}).items():
+            section, key = dotted.split(".")
+            table = raw.setdefault(section, {})
+            if isinstance(table, dict):
+                table[key] = value
         settings = Settings.model_validate(raw)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     except ValidationError as error:
         raise ConfigError(f"{path}: {_first_error(error, raw)}") from None
-    except (TypeError, AttributeError):
-        raise ConfigError(f"{path}: a section is not a table; see config/sim.toml") from None
     return _with_absolute_paths(settings, path.parent)
 
 
@@ -310,6 +327,16 @@ def absolute_law(law: str, base: Path) -> str:
     return f"{(base / path).resolve()}:{function}" if colon else law
 
 
+# What the validation calls by the names of Python, in those of TOML.
+_IN_TOML = {
+    "model_type": "a table",
+    "dict_type": "a table",
+    "tuple_type": "an array",
+    "too_long": "a pair",
+    "is_instance_of": "a path in quotes",
+}
+
+
 def _first_error(error: ValidationError, raw: Mapping[str, Any]) -> str:
     """One line for the first thing that is wrong: key, what, what to do."""
     first = error.errors()[0]
@@ -325,7 +352,7 @@ def _first_error(error: ValidationError, raw: Mapping[str, Any]) -> str:
         return message
     if first["type"] == "value_error":
         return f"{key}: {message}"
-    return f"{key}: has to be {message}, not {_shown(given)}"
+    return f"{key}: has to be {_IN_TOML.get(first['type'], message)}, not {_shown(given)}"
 
 
 def _shown(value: object) -> str:

@@ -57,5 +57,7 @@ def to_per_mille(torque_nm: float, nm_per_mille: float, limit_nm: float) -> int:
     """Torque as 0x6071 carries it: nearest step, none beyond ±limit, INTEGER16. NaN becomes 0."""
     if not math.isfinite(torque_nm):
         return 0
-    largest = min(math.floor(limit_nm / nm_per_mille + 1e-9), MAX_PER_MILLE)
-    return int(min(max(math.floor(torque_nm / nm_per_mille + 0.5), -largest), largest))
+    # Limited before it is rounded: a torque far beyond what an integer holds keeps its sign.
+    largest = math.floor(min(limit_nm / nm_per_mille + 1e-9, float(MAX_PER_MILLE)))
+    steps = min(max(torque_nm / nm_per_mille, -float(largest)), float(largest))
+    return math.floor(steps + 0.5)

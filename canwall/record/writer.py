@@ -6,7 +6,6 @@ first. Its last words go to standard output as JSON: what was written and what w
 
 import contextlib
 import json
-import os
 import select
 import sys
 from pathlib import Path
@@ -101,9 +100,8 @@ def main() -> None:
         while not select.select([sys.stdin], [], [], _POLL_S)[0]:
             ring.take_frames()
             ring.take_rows()
-    # Written past sys.stdout, which would complain at exit that a dead master does not listen.
     with contextlib.suppress(BrokenPipeError):
-        os.write(sys.stdout.fileno(), json.dumps({"error": error}).encode())
+        print(json.dumps({"error": error}), flush=True)
 
 
 if __name__ == "__main__":

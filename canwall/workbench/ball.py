@@ -53,12 +53,13 @@ class Ball:
     period: float = 0.1
     periods: int = 3000
     tension: str = "allow"
+    passivity: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("mass", "period"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
                 raise InputError(f"{name} has to be a number above 0, not {getattr(self, name):g}")
-        for name in ("stiffness", "damping", "viscous", "spring"):
+        for name in ("stiffness", "damping", "viscous", "spring", "passivity"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
                 raise InputError(f"{name} has to be 0 or above, not {getattr(self, name):g}")
         for name in ("gravity", "height", "speed"):
@@ -114,6 +115,7 @@ def sampled_ball(
     set_plant(wall, ball.mass, ball.viscous, ball.spring, ball.period)
     set_referent(wall, ball.stiffness, ball.damping, law.option_values(options))
     wall["tension"] = TENSION[ball.tension]
+    wall["passivity_damping"] = ball.passivity
     wall["d"] = -ball.mass * ball.gravity
     trajectory = np.zeros((3, ball.periods + 1))
     bounce(wall, law.address, ball.height, ball.speed, trajectory)
