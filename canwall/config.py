@@ -103,7 +103,7 @@ class Wall(_Section):
 class Estimator(_Section):
     """`[estimator]`: how fast the operator's force may change, for the Kalman filter."""
 
-    force_walk_nm_per_sqrt_s: Positive = 0.2
+    force_walk_nm_per_sqrt_s: Annotated[Positive, Field(ge=1e-4, le=100.0)] = 0.2
 
 
 class Limits(_Section):

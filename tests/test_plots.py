@@ -10,7 +10,6 @@ import pytest
 from commands import Record, command
 from matplotlib.figure import Figure
 
-from canwall import plots
 from canwall.config import ConfigError
 from canwall.plots import plot_run
 from canwall.record import RunFolder
@@ -28,7 +27,7 @@ def copied(four_strikes: Record, tmp_path: Path) -> RunFolder:
 @pytest.fixture
 def figure(copied: RunFolder, monkeypatch: pytest.MonkeyPatch) -> Figure:
     drawn: list[Figure] = []
-    monkeypatch.setattr(plots.Figure, "savefig", lambda self, path: drawn.append(self))
+    monkeypatch.setattr(Figure, "savefig", lambda self, path: drawn.append(self))
     plot_run(copied)
     (figure,) = drawn
     return figure

@@ -4,6 +4,10 @@ At the last sample outside, the contact ahead is known from the referent: when i
 which sample n the handle is outside again, and in which state. The last two forces of the
 contact drive it there exactly. n is predicted, not read off the sign of y (5.16 is acausal), and
 kept: the law underneath may bring the handle out a sample early.
+
+It is kept as long as the handle is where the forces should have brought it. Where it is not (the
+model is wrong, a force was clamped, the operator moves), the plan is made anew from where it is:
+what a stale plan wants of its last two forces grows with m/T².
 """
 
 import math
@@ -12,9 +16,12 @@ from canwall.compiled import Record, compiled
 from canwall.physics import contact_end, flow
 from canwall.walls.interface import free_step
 
-# Places in the law's memory: periods left until sample n, the state wanted there, and the last
-# of the two planned forces.
-_LEFT, _Y, _V, _LAST = 0, 1, 2, 3
+# Places in the memory of a law that plans: periods left until sample n, the state wanted there, the
+# last of the two planned forces, and the state that is expected at the next sample.
+LEFT, WANTED_Y, WANTED_V, LAST, EXPECTED_Y, EXPECTED_V = 0, 1, 2, 3, 4, 5
+
+#: Deviation from the expected state, relative to its size, that is still rounding.
+_ROUNDING = 1e-7
 
 
 @compiled
@@ -55,24 +62,51 @@ def first_sample_outside(wall: Record) -> tuple[int, float, float]:
 
 
 @compiled
+def expect(wall: Record, force: float) -> float:
+    """Note where `force` should bring the handle until the next sample; returns the force."""
+    memory = wall.memory
+    memory[EXPECTED_Y], memory[EXPECTED_V] = free_step(wall, wall.y, wall.v, force)
+    return force
+
+
+@compiled
+def is_as_expected(wall: Record) -> bool:
+    """Whether the handle is where the last force should have brought it."""
+    dy = abs(wall.y - wall.memory[EXPECTED_Y])
+    dv = abs(wall.v - wall.memory[EXPECTED_V])
+    size = abs(wall.y) + wall.period * abs(wall.v)
+    return dy + wall.period * dv <= _ROUNDING * size
+
+
+@compiled
+def plan_contact(wall: Record) -> int:
+    """Periods left of the contact: as planned while all goes as expected, else planned anew.
+
+    0 where no contact lies ahead, or one without an end. At least 2 for a new plan: two forces
+    take two periods, and a shorter contact has the handle on its way out for the second one.
+    """
+    memory = wall.memory
+    left = int(memory[LEFT])
+    if left > 1 and not is_as_expected(wall):
+        left = 0
+    if left == 0:
+        left, memory[WANTED_Y], memory[WANTED_V] = first_sample_outside(wall)
+        if left == 1:
+            memory[WANTED_Y], memory[WANTED_V] = free_step(
+                wall, memory[WANTED_Y], memory[WANTED_V], 0.0
+            )
+            left = 2
+    memory[LEFT] = float(max(left - 1, 0))
+    return left
+
+
+@compiled
 def compensated(wall: Record, force: float) -> float:
     """`force` of the law underneath, or what the plan for the end of the contact says."""
     memory = wall.memory
-    left = memory[_LEFT]
-    if left == 1.0:
-        memory[_LEFT] = 0.0
-        return memory[_LAST]
-    if left == 0.0:
-        n, memory[_Y], memory[_V] = first_sample_outside(wall)
-        if n == 0:
-            return force
-        if n == 1:
-            # Two forces take two periods: the handle is on its way out for the second one.
-            memory[_Y], memory[_V] = free_step(wall, memory[_Y], memory[_V], 0.0)
-            n = 2
-        left = float(n)
-    memory[_LEFT] = left - 1.0
-    if left > 2.0:
-        return force
-    first, memory[_LAST] = two_forces(wall, wall.y, wall.v, memory[_Y], memory[_V])
-    return first
+    left = plan_contact(wall)
+    if left == 1:
+        return memory[LAST]
+    if left == 2:
+        force, memory[LAST] = two_forces(wall, wall.y, wall.v, memory[WANTED_Y], memory[WANTED_V])
+    return expect(wall, force)

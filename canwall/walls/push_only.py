@@ -5,17 +5,24 @@ bring the handle, at the first sample after the contact, into the state in which
 wall would have left it, the one with the least change from the mean forces is taken:
 min |f − f̄|² with A·f = δ, f ≥ 0. Its dual has two unknowns whatever the length of the contact:
 f = max(0, f̄ + Aᵀ·λ), solved for λ by Newton's method with halved steps where a full one does not
-help. The plan is made anew at every sample for what is left of the contact.
+help. At every sample the forces that are left are planned anew, towards the same state as long as
+all goes as planned (`deadbeat`).
 """
 
 import math
 
 from canwall.compiled import Record, compiled
-from canwall.walls.deadbeat import first_sample_outside, two_forces
+from canwall.walls.deadbeat import (
+    LAST,
+    LEFT,
+    WANTED_V,
+    WANTED_Y,
+    expect,
+    plan_contact,
+    two_forces,
+)
 from canwall.walls.interface import HORIZON, free_step, law
 from canwall.walls.mean_force import force_over_interval
-
-_LEFT, _Y, _V = 0, 1, 2
 
 _MAX_ITERATIONS = 40
 _TOLERANCE = 1e-13
@@ -91,14 +98,15 @@ def _planned_force(wall: Record, count: int, y_wanted: float, v_wanted: float) -
 
 
 @compiled
-def _last_two(wall: Record, y_wanted: float, v_wanted: float) -> float:
-    """First of the last two forces, the second into the plan; NaN where one would have to pull."""
-    first, second = two_forces(wall, wall.y, wall.v, y_wanted, v_wanted)
+def _last_two(wall: Record) -> float:
+    """First of the last two forces, the second noted; NaN where one would have to pull."""
+    memory = wall.memory
+    first, second = two_forces(wall, wall.y, wall.v, memory[WANTED_Y], memory[WANTED_V])
     # What has to be zero comes out as a rounding error of the larger one.
     rounding = 1e-9 * max(abs(first), abs(second))
     if min(first, second) < -rounding:
         return math.nan
-    wall.plan[1] = max(second, 0.0)
+    memory[LAST] = max(second, 0.0)
     return max(first, 0.0)
 
 
@@ -106,25 +114,17 @@ def _last_two(wall: Record, y_wanted: float, v_wanted: float) -> float:
 def push_only(wall: Record) -> float:
     """First force of the pushing plan for what is left of the contact; else the mean force."""
     memory = wall.memory
-    if memory[_LEFT] == 0.0:
-        n, memory[_Y], memory[_V] = first_sample_outside(wall)
-        if n == 1:
-            memory[_Y], memory[_V] = free_step(wall, memory[_Y], memory[_V], 0.0)
-            n = 2
-        if n <= HORIZON:
-            memory[_LEFT] = float(n)
-    left = int(memory[_LEFT])
+    left = plan_contact(wall)
     force = math.nan
-    if left > 0:
-        memory[_LEFT] -= 1.0
-        if left == 1:
-            force = wall.plan[1]
-        elif left == 2:
-            force = _last_two(wall, memory[_Y], memory[_V])
-        else:
-            force = _planned_force(wall, left, memory[_Y], memory[_V])
-    if force >= 0.0:
-        return force
-    # No pushing leads there (any more): the mean force does not pull either.
-    memory[_LEFT] = 0.0
-    return max(force_over_interval(wall, wall.y, wall.v)[0], 0.0)
+    if left == 1:
+        force = memory[LAST]
+    elif left == 2:
+        force = _last_two(wall)
+    elif 2 < left <= HORIZON:
+        force = _planned_force(wall, left, memory[WANTED_Y], memory[WANTED_V])
+    if not force >= 0.0:
+        # No pushing leads there (any more), or the contact is too long to be planned: the mean
+        # force does not pull either, and what it loses is for the next plan to start from.
+        memory[LEFT] = 0.0
+        force = max(force_over_interval(wall, wall.y, wall.v)[0], 0.0)
+    return expect(wall, force)

@@ -96,7 +96,8 @@ class _Ready:
     """An enabled drive, and a wall to be rendered on it."""
 
     bus: StopwatchBus
-    drive: simdrive.BusRunner
+    drive: simdrive.SimulatedDrive
+    runner: simdrive.BusRunner
     link: Link
     setup: DriveSetup
     cycle: NDArray[np.void]
@@ -111,8 +112,9 @@ def _ready() -> Iterator[_Ready]:
         StopwatchBus(channel, 0x180 + node_id, 0x200 + node_id) as bus,
         VirtualBus(channel) as drive_bus,
     ):
-        drive = simdrive.BusRunner(make_simulated_drive(settings), drive_bus)
-        link = Link(bus, idle=drive.poll)
+        drive = make_simulated_drive(settings)
+        runner = simdrive.BusRunner(drive, drive_bus)
+        link = Link(bus, idle=runner.poll)
         dictionary = load_eds(settings.drive.eds, node_id, REQUIRED_OBJECTS)
         node = DriveNode(link, node_id, dictionary)
         setup = set_up(node, settings.drive)
@@ -121,7 +123,7 @@ def _ready() -> Iterator[_Ready]:
         cycle = make_cycle(settings, setup, run_laws(settings))
         cycle["phase"], cycle["controlword"] = Phase.RENDERING, _ENABLE_OPERATION
         start_at(cycle, node.read(0x6064))
-        yield _Ready(bus, drive, link, setup, cycle)
+        yield _Ready(bus, drive, runner, link, setup, cycle)
 
 
 def exchange() -> dict[str, Any]:
@@ -189,7 +191,7 @@ def _durations_the_usual_way() -> NDArray[np.int64]:
             for _ in range(_CYCLES):
                 sent.clear()
                 network.sync.transmit()
-                ready.drive.poll()
+                ready.runner.poll()
                 if not sent.wait(10.0):
                     raise RuntimeError("no RPDO came")
             return _checked(ready)
@@ -208,18 +210,15 @@ def simulated_drive() -> dict[str, Any]:
     """Cycles per second of the simulated drive alone: SYNC and RPDO in, TPDO out, physics."""
     rates = []
     for _ in range(_REPEATS):
-        settings = _settings()
-        channel = f"bench {next(_channels)}"
-        drive = make_simulated_drive(settings)
-        with VirtualBus(channel) as bus, VirtualBus(channel) as drive_bus:
-            link = Link(bus, idle=simdrive.BusRunner(drive, drive_bus).poll)
-            dictionary = load_eds(settings.drive.eds, settings.drive.node_id, REQUIRED_OBJECTS)
-            setup = set_up(DriveNode(link, settings.drive.node_id, dictionary), settings.drive)
+        with _ready() as ready:
+            process, setup = ready.drive.process, ready.setup
         begin = time.perf_counter()
         for _ in range(_CYCLES):
-            drive.process(setup.sync_cob_id, b"")
-            drive.process(setup.rpdo.cob_id, b"\x0f\0\0\0")
+            frames = process(setup.sync_cob_id, b"")
+            process(setup.rpdo.cob_id, b"\x0f\0\0\0")
         rates.append(_CYCLES / (time.perf_counter() - begin))
+        if frames[0][0] != setup.tpdo.cob_id:
+            raise RuntimeError("the drive sent no TPDO")
     return {
         "cycles_per_s": round(statistics.median(rates)),
         "repeats": [round(rate) for rate in rates],

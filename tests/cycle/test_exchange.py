@@ -97,7 +97,7 @@ def test_simulated_time_waits_for_the_writer_of_the_record(
 ) -> None:
     loop = Loop(rig)
     loop.ring.header["frame_head"] = FRAMES  # full
-    naps = []
+    naps: list[float] = []
 
     def nap(duration_s: float) -> None:
         naps.append(duration_s)
@@ -116,7 +116,7 @@ def test_writer_that_is_gone_is_not_waited_for_for_ever(
 ) -> None:
     loop = Loop(rig)
     loop.ring.header["frame_head"] = FRAMES
-    slept = []
+    slept: list[float] = []
     monkeypatch.setattr(
         exchange_module, "time", fake_time(sleep=slept.append, monotonic=lambda: len(slept))
     )

@@ -84,6 +84,8 @@ def test_in_and_out(make_rig: RigFactory) -> None:
     enabling = rows[rows["phase"] == Phase.ENABLING]
     assert steps(enabling["controlword"].tolist()) == UP[: len(steps(enabling["controlword"]))]
     assert not enabling["torque_cmd_per_mille"].any()
+    # The handle rests at 0.1 rad: the estimator has nothing to find out.
+    assert np.abs(enabling["v_est"][1:]).max() < 0.01
     assert np.abs(rows["torque_cmd_per_mille"]).max() > 50
     assert not any(collecting)
     assert_ended_in_order(loop, outcome, rows)

@@ -168,7 +168,7 @@ def bounce(address: int, wall: Record, speed: float, phase: float, energies: Arr
     y, v = -speed * t - 0.5 * t * t, -speed - t
     for i in range(len(energies)):
         was_inside = False
-        while not (was_inside and y >= 0.0):
+        for _ in range(100_000):
             was_inside = was_inside or y < 0.0
             wall.y, wall.v, wall.y_sample, wall.v_sample = y, v, y, v
             u = call_law(address, wall) + wall.d
@@ -176,17 +176,19 @@ def bounce(address: int, wall: Record, speed: float, phase: float, energies: Arr
                 phi[0, 0] * y + phi[0, 1] * v + gamma[0] * u,
                 phi[1, 0] * y + phi[1, 1] * v + gamma[1] * u,
             )
-        energies[i] = 0.5 * v * v + y
+            if was_inside and y >= 0.0:
+                energies[i] = 0.5 * v * v + y
+                break
 
 
 def changes_per_bounce(law: str, theta: float, bounces: int) -> Array:
     """Changes of ln E from bounce to bounce, K = m = g = 1, first entry speed 5, ten phases."""
     wall = make_wall(1.0, period=theta)
-    logarithms = np.full((10, bounces + 1), math.log(0.5 * 5.0**2))
-    for row, phase in zip(logarithms, np.linspace(0.05, 0.95, 10), strict=True):
+    energies = np.full((10, bounces + 1), math.nan)
+    energies[:, 0] = 0.5 * 5.0**2
+    for row, phase in zip(energies, np.linspace(0.05, 0.95, 10), strict=True):
         bounce(LAWS[law].address, wall[0], 5.0, phase, row[1:])
-    logarithms[:, 1:] = np.log(logarithms[:, 1:])
-    return np.diff(logarithms, axis=1)
+    return np.diff(np.log(energies), axis=1)
 
 
 # The anchors of theory, section 7, are means over bounces that follow one another: as it gains,
@@ -204,6 +206,6 @@ def test_standard_gains_energy_at_every_bounce(theta: float, mean: float) -> Non
 def test_half_sample_keeps_the_energy_on_average(
     theta: float, mean: float, deviation: float
 ) -> None:
-    changes = changes_per_bounce("half_sample", theta, bounces=200)
+    changes = changes_per_bounce("half_sample", theta, bounces=100)
     assert changes.mean() == pytest.approx(mean, abs=0.1 * deviation)
     assert changes.std() == pytest.approx(deviation, rel=0.1)
