@@ -1,6 +1,9 @@
 """How this project compiles: one decorator, and one name for a record in compiled code."""
 
+import contextlib
+import hashlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, ParamSpec, TypeAlias, TypeVar
 
 from numba import njit
@@ -11,6 +14,29 @@ _R = TypeVar("_R")
 #: One element of a structured array, e.g. `walls[0]`. In compiled code its fields are attributes
 #: and can be written; Python's type checkers know of no such thing, so it is Any to them.
 Record: TypeAlias = Any
+
+
+def _drop_stale_code() -> None:
+    """Remove compiled code that was kept on disk before any source of the package changed.
+
+    numba sees a change of the file that a function stands in, not of those that it calls into: a
+    law would go on using the estimator of the day on which it was compiled.
+    """
+    package = Path(__file__).resolve().parent
+    sources = sorted(package.rglob("*.py"))
+    states = [(str(s.relative_to(package)), s.stat().st_mtime_ns) for s in sources]
+    digest = hashlib.sha256(repr(states).encode()).hexdigest()
+    note = package / "__pycache__" / "sources.sha256"
+    with contextlib.suppress(OSError):  # an installation that may not be written keeps no code
+        if note.exists() and note.read_text() == digest:
+            return
+        for kept in (*package.rglob("*.nbi"), *package.rglob("*.nbc")):
+            kept.unlink(missing_ok=True)
+        note.parent.mkdir(exist_ok=True)
+        note.write_text(digest)
+
+
+_drop_stale_code()
 
 
 def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:

@@ -65,14 +65,15 @@ WALL_TYPE = from_dtype(WALL)
 LAW_SIGNATURE = types.float64(WALL_TYPE)
 
 
-def law(function: Callable[[Any], float]) -> Any:
+def law(function: Callable[[Any], float], keep: bool = True) -> Any:
     """Compile a function of one WALL record into a law that compiled code calls by address.
 
     The address stands in a record, so laws can be exchanged between two cycles without touching
-    the code that calls them. Returns numba's CFunc. Raises numba's TypingError where the function
-    is not within what numba compiles.
+    the code that calls them. `keep` keeps what was compiled on disk, for functions of this
+    package only: whether it has changed is not watched elsewhere (`compiled`). Returns numba's
+    CFunc. Raises numba's TypingError where the function is not within what numba compiles.
     """
-    return cfunc(LAW_SIGNATURE, cache=True, error_model="numpy")(function)
+    return cfunc(LAW_SIGNATURE, cache=keep, error_model="numpy")(function)
 
 
 @intrinsic

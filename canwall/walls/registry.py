@@ -5,9 +5,7 @@ A user's law is named by file and function, `my_law.py:my_law`. The function tak
 what `[wall.options]` may set, in the order in which the function finds them in `wall.options`.
 """
 
-import hashlib
 import importlib.util
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -126,17 +124,13 @@ def _load(path: Path, function: str) -> Law:
     where = f"{path}:{function}"
     if not path.is_file():
         raise UnknownLawError(f"{where}: no such file")
-    # What numba keeps on disk refers to the module by name: it has to be one that can be found,
-    # and that no other file has.
-    unique = hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:8]
-    spec = importlib.util.spec_from_file_location(f"{path.stem}_{unique}", path)
+    spec = importlib.util.spec_from_file_location(path.stem, path)
     if spec is None or spec.loader is None:
         raise UnknownLawError(f"{where}: not a Python file")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[module.__name__] = module
     try:
         spec.loader.exec_module(module)
-        found = law(getattr(module, function))
+        found = law(getattr(module, function), keep=False)
     except AttributeError:
         raise UnknownLawError(f"{where}: the file has no such function") from None
     except NumbaError as error:

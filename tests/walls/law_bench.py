@@ -23,13 +23,13 @@ PREDICTING = ("half_sample", "midpoint", "pole_placement")
 COMPENSATED = ("half_sample+deadbeat", "pole_placement+deadbeat")
 
 
-def wall_of(ball: Ball, law: str, passivity: float = 0.0, **options: float) -> NDArray[np.void]:
+def wall_of(ball: Ball, law: str, **options: float) -> NDArray[np.void]:
     """The WALL record of a ball on its floor."""
     wall = np.zeros(1, WALL)
     set_plant(wall, ball.mass, ball.viscous, ball.spring, ball.period)
     set_referent(wall, ball.stiffness, ball.damping, LAWS[law].option_values(options))
     wall["tension"] = TENSION[ball.tension]
-    wall["passivity_damping"] = passivity
+    wall["passivity_damping"] = ball.passivity
     wall["d"] = -ball.mass * ball.gravity
     return wall
 

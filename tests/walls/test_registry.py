@@ -78,8 +78,8 @@ def _counted_allocations() -> Iterator[None]:
 
 def allocations(law: Law) -> int:
     """What numba's runtime allocates while a ball bounces on a law."""
-    ball = Ball(stiffness=9.0, damping=0.1, viscous=0.01, spring=0.1, tension="budget")
-    wall = wall_of(ball, "standard", passivity=0.5)
+    ball = Ball(9.0, damping=0.1, viscous=0.01, spring=0.1, tension="budget", passivity=0.5)
+    wall = wall_of(ball, "standard")
     wall["options"][0, : len(law.options)] = law.option_values({})
     trajectory = np.zeros((3, 1000))
     bounce(wall, law.address, 1.0, 0.0, trajectory)  # compiled by now

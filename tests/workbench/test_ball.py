@@ -102,7 +102,7 @@ def test_half_sample_gains_nothing_and_deadbeat_nothing_at_all(theta: float, spr
     [
         dropped(0.3),
         dropped(0.3, viscous=0.02, spring=0.4, damping=0.1),
-        dropped(1.0, viscous=0.05, tension="budget"),
+        dropped(1.0, viscous=0.05, tension="budget", passivity=0.3),
         dropped(0.3, spring=0.4, mass=0.3, gravity=9.81, tension="clamp"),
     ],
 )
@@ -464,7 +464,7 @@ def test_extremes_end_in_numbers(law: str, changes: dict[str, float]) -> None:
     ("name", "wrong"),
     [(name, x) for name in ("mass", "period") for x in (0.0, -1.0, math.nan, math.inf)]
     + [(n, x) for n in ("stiffness", "damping") for x in (-1.0, math.nan, math.inf)]
-    + [(n, x) for n in ("viscous", "spring") for x in (-1.0, math.nan, math.inf)]
+    + [(n, x) for n in ("viscous", "spring", "passivity") for x in (-1.0, math.nan, math.inf)]
     + [(n, x) for n in ("gravity", "height", "speed") for x in (math.nan, math.inf, -math.inf)]
     + [("periods", -1), ("tension", "alow")],
 )

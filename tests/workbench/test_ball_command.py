@@ -95,9 +95,10 @@ def test_every_option_reaches_the_ball(bounce: Bounce) -> None:
         *("--law", "pole_placement", "--deadbeat", "--stiffness", 31.0, "--damping", 0.4),
         *("--mass", 0.7, "--viscous", 0.05, "--spring", 0.6, "--gravity", 2.5, "--height", 0.8),
         *("--speed", -0.3, "--period", 0.03, "--periods", 700, "--tension", "budget"),
+        *("--passivity", 0.2),
     )
     assert bounce(*words).code == 0
-    ball = Ball(31.0, 0.4, 0.7, 0.05, 0.6, 2.5, 0.8, -0.3, 0.03, 700, "budget")
+    ball = Ball(31.0, 0.4, 0.7, 0.05, 0.6, 2.5, 0.8, -0.3, 0.03, 700, "budget", 0.2)
     t, y, v, force = bounce.columns()
     expected = sampled_ball(ball, LAWS["pole_placement+deadbeat"])
     np.testing.assert_array_equal([y, v, force], expected)
@@ -153,6 +154,7 @@ def test_installed_command(tmp_path: Path) -> None:
         ("--stiffness -1", "stiffness has to be 0 or above, not -1"),
         ("--stiffness nan", "stiffness has to be 0 or above, not nan"),
         ("--damping inf", "damping has to be 0 or above, not inf"),
+        ("--passivity nan", "passivity has to be 0 or above, not nan"),
         ("--gravity nan", "gravity has to be a number, not nan"),
         ("--height -inf", "height has to be a number, not -inf"),
         ("--speed fast", "Invalid value for '--speed': "),
