@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
-from canwall.config import ConfigError, Settings, Wall
+from canwall.config import Settings, Wall
 from canwall.drive import DriveSetup, PdoLayout, State
 from canwall.drive import objects as od
 from canwall.record import Phase
@@ -113,8 +113,7 @@ def make_cycle(settings: Settings, setup: DriveSetup, laws: Sequence[Law]) -> ND
     """The record of one wall, ready for its first cycle; shape (1,), dtype CYCLE.
 
     `laws` are the laws of the run; a row's `law` is an index into them. Raises UnknownLawError
-    for options that a law does not have, and ConfigError where estimator and cycle do not go
-    together.
+    for options that a law does not have.
     """
     cycle = np.zeros(1, CYCLE)
     for name, layout, index in (
@@ -140,20 +139,17 @@ def make_cycle(settings: Settings, setup: DriveSetup, laws: Sequence[Law]) -> ND
     mass, viscous = mechanics.inertia_kg_m2, mechanics.viscous_nm_s_per_rad
     spring = mechanics.spring_nm_per_rad
     set_plant(cycle["wall"][0], mass, viscous, spring, period)
-    try:
-        set_estimator(
-            cycle["estimator"][0],
-            mass,
-            viscous,
-            spring,
-            mechanics.coulomb_nm,
-            period,
-            count=units.rad_per_count,
-            force_walk=settings.estimator.force_walk_nm_per_sqrt_s,
-            delay=SYNCHRONOUS_DELAY,
-        )
-    except ValueError as error:
-        raise ConfigError(f"estimator.force_walk_nm_per_sqrt_s: {error}") from None
+    set_estimator(
+        cycle["estimator"][0],
+        mass,
+        viscous,
+        spring,
+        mechanics.coulomb_nm,
+        period,
+        count=units.rad_per_count,
+        force_walk=settings.estimator.force_walk_nm_per_sqrt_s,
+        delay=SYNCHRONOUS_DELAY,
+    )
     set_wall(cycle, settings.wall, laws)
     return cycle
 

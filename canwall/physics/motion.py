@@ -162,15 +162,16 @@ def _segment(
         force = u0 - direction * plant.coulomb
     else:
         pull = u0 - spring * y
-        if abs(pull) > plant.coulomb:
-            direction = 1.0 if pull > 0.0 else -1.0
-            force = u0 - direction * plant.coulomb
-        else:
+        direction = 1.0 if pull > 0.0 else -1.0
+        force = u0 - direction * plant.coulomb
+        # Asked of what the flow will be given: one that rounds to the other side of the
+        # threshold would be turned back at once, and time would stand still.
+        if direction * (force - spring * y) <= 0.0:
             # Stuck until the ramp of the external force breaks it loose, if it does.
             if u1 == 0.0:
                 return remaining, y, v
             direction = 1.0 if u1 > 0.0 else -1.0
-            stuck = (plant.coulomb - direction * pull) / abs(u1)
+            stuck = max(plant.coulomb - direction * pull, 0.0) / abs(u1)
             if stuck >= remaining:
                 return remaining, y, v
             # Friction and spring balance to the last bit here; recomputed from u₀ + u₁·t the
@@ -255,8 +256,13 @@ def contact_end(plant: Record, y: float, v: float, u: float, horizon: float) -> 
             break
         outward = v > 0.0
         entered = entered or inside
-        dt, y, v = _segment(plant, y, v, u, 0.0, math.inf if inside else horizon - t, inside)
+        remaining = horizon - t
+        if inside:
+            # A quarter period at a time; without a spring, as far ahead as was asked for.
+            swings = plant.spring > 0.0 or plant.wall_stiffness > 0.0
+            remaining = math.inf if swings else horizon
+        dt, y, v = _segment(plant, y, v, u, 0.0, remaining, inside)
         t += dt
-        if inside and v == 0.0 and (outward or not dt < math.inf):
+        if inside and v == 0.0 and outward:
             break
     return math.inf, 0.0

@@ -82,12 +82,10 @@ def flow(
     """
     kappa = spring / mass
     h1, h0, g1, g2 = basis(viscous / mass, kappa, t)
-    a0 = u0 / mass
+    # From equilibrium nothing moves, to the last bit: what pulls is summed up before it acts.
+    a0 = (u0 - spring * y) / mass
     a1 = u1 / mass
-    return (
-        y * (1.0 - kappa * g1) + v * h0 + a0 * g1 + a1 * g2,
-        -y * kappa * h0 + v * h1 + a0 * h0 + a1 * g1,
-    )
+    return y + v * h0 + a0 * g1 + a1 * g2, v * h1 + a0 * h0 + a1 * g1
 
 
 @compiled

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rig import settings_with
 
-from canwall.config import ConfigError, Settings
+from canwall.config import Settings
 from canwall.cycle import Trip, make_cycle, set_wall, step
 from canwall.cycle.step import start_at
 from canwall.drive import DriveSetup, Field, PdoLayout
@@ -338,8 +338,3 @@ def test_law_that_nobody_knows() -> None:
     wall = Wall()
     with pytest.raises(UnknownLawError):
         set_wall(wall.cycle, wall.settings.wall.model_copy(update={"law": "none"}), wall.laws)
-
-
-def test_estimator_that_cannot_be() -> None:
-    with pytest.raises(ConfigError, match=r"^estimator.force_walk_nm_per_sqrt_s: "):
-        Wall({"estimator.force_walk_nm_per_sqrt_s": 1e30})

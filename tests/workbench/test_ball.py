@@ -121,6 +121,15 @@ def test_state_is_that_of_the_held_force(law: str, ball: Ball) -> None:
     assert force[-1] == 0.0
 
 
+def test_damper_is_on_the_backward_difference() -> None:
+    ball = dropped(0.5, damping=0.4, height=-0.1, speed=-2.0, periods=200)
+    y, _, force = sampled_ball(ball, LAWS["damped"])
+    # At the first sample there is none yet, but a velocity.
+    velocity = np.concatenate([[-2.0], np.diff(y) / ball.period])
+    expected = np.where(y < 0.0, -25.0 * y - 0.4 * velocity, 0.0)
+    np.testing.assert_allclose(force[:-1], expected[:-1], rtol=1e-12, atol=0.0)
+
+
 # The referent
 
 
