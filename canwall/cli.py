@@ -1,5 +1,6 @@
 """The commands, thin: options in, one call, tables and error lines out."""
 
+import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -151,16 +152,21 @@ def ball(
         tension=tension,
         passivity=passivity,
     )
-    if law == CONTINUOUS and (deadbeat or option):
-        raise InputError("--law continuous is no law: it has no --deadbeat and no --option")
+    if law == CONTINUOUS and (deadbeat or option or tension != "allow" or passivity):
+        raise InputError(
+            "--law continuous is no law: it has no --deadbeat, --tension, --passivity, --option"
+        )
     name = law if law == CONTINUOUS else absolute_law(law, Path())
     y, v, force = bounced(ball, name, deadbeat, _named_numbers(option or []))
     write_ball(output, ball, y, v, force)
     energy = ball.energy(y, v)
-    last = int((y >= 0.0).nonzero()[0].max(initial=0))
+    outside = (y >= 0.0).nonzero()[0]
+    end = "never outside"
+    if len(outside):
+        last = int(outside[-1])
+        end = f"{energy[last]:.9g} at the last sample outside (t = {last * period:g})"
     _console.print(
-        f"θ = {ball.theta:g}; energy {energy[0]:.9g} at the start, {energy[last]:.9g} at the last "
-        f"sample outside (t = {last * period:g})",
+        f"θ = {ball.theta:g}; energy {energy[0]:.9g} at the start, {end}",
         highlight=False,
         soft_wrap=True,
     )
@@ -175,7 +181,7 @@ def _named_numbers(given: list[str]) -> dict[str, float]:
             numbers[name] = float(value)
         except ValueError:
             equals = ""
-        if not equals:
+        if not equals or not math.isfinite(numbers[name]):
             raise InputError(f"--option {text}: has to be NAME=NUMBER")
     return numbers
 

@@ -225,6 +225,8 @@ class Settings(_Section):
         timeline = [(0.0, self.wall)]
         for change in self.schedule:
             update = change.model_dump(exclude={"at_s"}, exclude_none=True)
+            if change.law is not None:
+                update.setdefault("options", {})  # they were the other law's
             timeline.append((change.at_s, timeline[-1][1].model_copy(update=update)))
         return timeline
 

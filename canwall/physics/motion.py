@@ -84,6 +84,7 @@ def _root(
     rising: bool,
 ) -> float:
     """The root of position, velocity or acceleration in (low, high]: Newton kept in its bracket."""
+    rounding = 4e-16 * high
     t = 0.5 * (low + high)
     for _ in range(_MAX_ITERATIONS):
         y_t, v_t, a_t, jerk_t = _derivatives(mass, viscous, spring, y, v, u0, u1, t)
@@ -98,10 +99,12 @@ def _root(
         else:
             high = t
         step = value / slope if slope != 0.0 else math.inf
+        if abs(step) <= rounding:
+            return t
         proposal = t - step
         if not low < proposal < high:
             proposal = 0.5 * (low + high)
-        if abs(proposal - t) <= 2e-16 * high or proposal in (low, high):
+        if abs(proposal - t) <= rounding or proposal in (low, high):
             return proposal
         t = proposal
     return t

@@ -13,7 +13,7 @@ what a stale plan wants of its last two forces grows with m/T².
 import math
 
 from canwall.compiled import Record, compiled
-from canwall.physics import contact_end, flow
+from canwall.physics import advance, contact_end
 from canwall.walls.interface import free_step
 
 # Places in the memory of a law that plans: periods left until sample n, the state wanted there, the
@@ -55,9 +55,8 @@ def first_sample_outside(wall: Record) -> tuple[int, float, float]:
     if not end < math.inf:
         return 0, 0.0, 0.0
     n = int(end / wall.period) + 1
-    y, v = flow(
-        wall.mass, wall.viscous, wall.spring, 0.0, v_end, wall.d, 0.0, n * wall.period - end
-    )
+    # In what is left of the period the handle may be back in the wall.
+    y, v, _ = advance(referent, 0.0, v_end, wall.d, 0.0, n * wall.period - end)
     return n, y, v
 
 
@@ -92,8 +91,8 @@ def plan_contact(wall: Record) -> int:
     if left == 0:
         left, memory[WANTED_Y], memory[WANTED_V] = first_sample_outside(wall)
         if left == 1:
-            memory[WANTED_Y], memory[WANTED_V] = free_step(
-                wall, memory[WANTED_Y], memory[WANTED_V], 0.0
+            memory[WANTED_Y], memory[WANTED_V], _ = advance(
+                wall.referent[0], memory[WANTED_Y], memory[WANTED_V], wall.d, 0.0, wall.period
             )
             left = 2
     memory[LEFT] = float(max(left - 1, 0))

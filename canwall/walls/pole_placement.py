@@ -5,8 +5,10 @@ says Aizerman). It matches how fast the motion turns and decays, not its samples
 of the position is off by (θ/2)/tan(θ/2).
 """
 
+import math
+
 from canwall.compiled import Record, compiled
-from canwall.physics import zoh_coefficients
+from canwall.physics import basis
 from canwall.walls.deadbeat import compensated
 from canwall.walls.interface import law
 
@@ -14,18 +16,20 @@ from canwall.walls.interface import law
 @compiled
 def placing_gains(wall: Record) -> tuple[float, float]:
     """k of f = −k·x, from Ackermann's formula k = [0 1]·[Γ ΦΓ]⁻¹·p(Φ)."""
-    r11, r12, r21, r22, _, _ = zoh_coefficients(
-        wall.mass, wall.viscous + wall.damping, wall.spring + wall.stiffness, wall.period
-    )
-    trace, determinant = r11 + r22, r11 * r22 - r12 * r21
+    period = wall.period
+    own_damping, own_stiffness = wall.viscous / wall.mass, wall.spring / wall.mass
+    damping = own_damping + wall.damping / wall.mass
+    stiffness = own_stiffness + wall.stiffness / wall.mass
+    _, own_h, own_g, _ = basis(own_damping, own_stiffness, period)
+    _, h, g, _ = basis(damping, stiffness, period)
     phi, gamma = wall.phi, wall.gamma
     g1, g2 = gamma[0], gamma[1]
     h1 = phi[0, 0] * g1 + phi[0, 1] * g2
     h2 = phi[1, 0] * g1 + phi[1, 1] * g2
-    # By Cayley-Hamilton p(Φ) = (tr Φ − tr)·Φ + (det − det Φ)·I, without cancellation of squares.
-    own_trace = phi[0, 0] + phi[1, 1]
-    own_determinant = phi[0, 0] * phi[1, 1] - phi[0, 1] * phi[1, 0]
-    a, b = own_trace - trace, determinant - own_determinant
+    # By Cayley-Hamilton p(Φ) = (tr Φ − tr)·Φ + (det − det Φ)·I. Both traces are 2 − 2κ·∫h − β·h
+    # and both determinants e^(−βT): written so, what is small is not the rest of a difference.
+    a = 2.0 * (stiffness * g - own_stiffness * own_g) + (damping * h - own_damping * own_h)
+    b = math.exp(-own_damping * period) * math.expm1(-(damping - own_damping) * period)
     area = g1 * h2 - g2 * h1  # det [Γ ΦΓ]
     # The last row of its inverse is [−g2, g1]/area.
     k1 = (-g2 * (a * phi[0, 0] + b) + g1 * a * phi[1, 0]) / area
@@ -41,7 +45,7 @@ def placed_force(wall: Record) -> float:
     k1, k2 = placing_gains(wall)
     # Under a bias force the wall's equilibrium has to be kept: there it holds −K·y_eq.
     y_eq = wall.d / (wall.spring + wall.stiffness)
-    return -wall.stiffness * y_eq - k1 * (wall.y - y_eq) - k2 * wall.v
+    return -k1 * wall.y - k2 * wall.v - (wall.stiffness - k1) * y_eq
 
 
 @law

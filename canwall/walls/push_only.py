@@ -24,7 +24,7 @@ from canwall.walls.deadbeat import (
 from canwall.walls.interface import HORIZON, free_step, law
 from canwall.walls.mean_force import force_over_interval
 
-_MAX_ITERATIONS = 40
+_MAX_ITERATIONS = 12
 _TOLERANCE = 1e-13
 
 
@@ -73,10 +73,16 @@ def _planned_force(wall: Record, count: int, y_wanted: float, v_wanted: float) -
         if error <= (_TOLERANCE * size) ** 2:
             break
         determinant = j11 * j22 - j12 * j12
-        if determinant <= 1e-14 * j11 * j22:
+        if determinant > 1e-14 * j11 * j22:
+            s1 = (j22 * r1 - j12 * r2) / determinant
+            s2 = (j11 * r2 - j12 * r1) / determinant
+        elif j11 > 0.0:
+            # A single force pushes: as far as it reaches, by the pseudo-inverse.
+            square = (j11 + j22) ** 2
+            s1 = (j11 * r1 + j12 * r2) / square
+            s2 = (j12 * r1 + j22 * r2) / square
+        else:
             return math.nan
-        s1 = (j22 * r1 - j12 * r2) / determinant
-        s2 = (j11 * r2 - j12 * r1) / determinant
         share = 1.0
         while True:
             n1, n2 = l1 - share * s1, l2 - share * s2

@@ -9,7 +9,7 @@ import importlib.util
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import ModuleType
+from types import FunctionType, ModuleType
 from typing import Any
 
 from numba.core.errors import NumbaError
@@ -130,20 +130,28 @@ def _load(path: Path, function: str) -> Law:
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-        found = law(getattr(module, function), keep=False)
-    except AttributeError:
-        raise UnknownLawError(f"{where}: the file has no such function") from None
-    except NumbaError as error:
-        raise UnknownLawError(f"{where}: does not compile: {_gist(error)}") from None
-    except Exception as error:  # whatever the user's file raises when it is run
+    except (Exception, SystemExit) as error:  # whatever the user's file does when it is run
         raise UnknownLawError(f"{where}: {type(error).__name__}: {_gist(error)}") from None
+    written = getattr(module, function, None)
+    if not isinstance(written, FunctionType):
+        raise UnknownLawError(f"{where}: the file has no such function")
     options = getattr(module, "OPTIONS", {})
+    if not (
+        isinstance(options, dict)
+        and all(isinstance(n, str) and isinstance(v, int | float) for n, v in options.items())
+    ):
+        raise UnknownLawError(f"{where}: OPTIONS has to be a dictionary of names and numbers")
     if len(options) > MAX_OPTIONS:
         raise UnknownLawError(f"{where}: {len(options)} options; a law may have {MAX_OPTIONS}")
-    return Law(where, found, options)
+    try:
+        return Law(where, law(written, keep=False), options)
+    except NumbaError as error:
+        raise UnknownLawError(f"{where}: does not compile: {_gist(error)}") from None
+    except Exception as error:  # numba lets what it trips over through
+        raise UnknownLawError(f"{where}: {type(error).__name__}: {_gist(error)}") from None
 
 
-def _gist(error: Exception) -> str:
+def _gist(error: BaseException) -> str:
     """The line of a message that says most: numba's first ones only name the pipeline."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     telling = [line for line in lines if not line.startswith(("Failed in", "File ", "During"))]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
-from canwall.errors import InputError
+from canwall.errors import InputError, RunFailedError
 from canwall.physics import advance, make_plant
 from canwall.walls import (
     TENSION,
@@ -32,6 +32,10 @@ Array = NDArray[np.float64]
 
 #: What stands for a law's name where the continuous referent is meant.
 CONTINUOUS = "continuous"
+#: What a ball's record may hold, and how hard its floor may be for the sample rate: the referent
+#: is followed through every quarter of its swings.
+MAX_PERIODS = 100_000_000
+MAX_THETA = 1e4
 
 
 @dataclass(frozen=True)
@@ -65,8 +69,11 @@ class Ball:
         for name in ("gravity", "height", "speed"):
             if not math.isfinite(getattr(self, name)):
                 raise InputError(f"{name} has to be a number, not {getattr(self, name):g}")
-        if self.periods < 0:
-            raise InputError(f"periods has to be 0 or above, not {self.periods}")
+        if not 0 <= self.periods <= MAX_PERIODS:
+            raise InputError(f"periods has to be 0 … {MAX_PERIODS}, not {self.periods}")
+        hardest = self.period * math.sqrt((self.stiffness + self.spring) / self.mass)
+        if not hardest <= MAX_THETA:
+            raise InputError(f"T·√(K/m) has to be {MAX_THETA:g} or below, not {hardest:g}")
         if self.tension not in TENSION:
             raise InputError(f"tension has to be one of {', '.join(TENSION)}, not {self.tension!r}")
 
@@ -87,11 +94,17 @@ def bounced(
 ) -> tuple[Array, Array, Array]:
     """(y, ẏ, f) of `sampled_ball` for the law of that name, or of `continuous_ball`.
 
-    Raises UnknownLawError.
+    Raises UnknownLawError, and RunFailedError where the trajectory overflows.
     """
     if law == CONTINUOUS:
-        return continuous_ball(ball)
-    return sampled_ball(ball, find_law(law, deadbeat), options or {})
+        trajectory = continuous_ball(ball)
+    else:
+        trajectory = sampled_ball(ball, find_law(law, deadbeat), options or {})
+    lost = ~np.isfinite(np.sum(trajectory, axis=0))
+    if lost.any():
+        instant = float(lost.argmax()) * ball.period
+        raise RunFailedError(f"{law}: the ball is beyond all numbers at t = {instant:g}")
+    return trajectory
 
 
 def write_ball(path: Path, ball: Ball, y: Array, v: Array, force: Array) -> None:

@@ -22,7 +22,6 @@ PLANTS = {
     "friction and a spring": replace(BALL, viscous=0.2, spring=3.0),
     "all of it": replace(BALL, viscous=0.2, spring=3.0, damping=4.0),
 }
-UNDAMPED_FLOORS = ("mass", "friction and a spring")
 
 
 def with_floor(ball: Ball, theta: float) -> Ball:
@@ -153,7 +152,7 @@ def test_push_only_is_the_least_change_that_arrives(theta: float, plant: str, ph
 
 
 @pytest.mark.parametrize("phase", [0.03, 0.4, 0.8])
-@pytest.mark.parametrize("plant", UNDAMPED_FLOORS)
+@pytest.mark.parametrize("plant", PLANTS)
 @pytest.mark.parametrize("theta", [0.11, 0.23, 0.5, 1.1])
 def test_push_only_planned_anew_at_every_sample_arrives(
     theta: float, plant: str, phase: float

@@ -124,3 +124,11 @@ def test_compensation_leaves_a_contact_without_end_alone(law: str) -> None:
     wall, plain = wall_of(ball, law), wall_of(ball, base)
     for y, v in ((-0.1, 0.0), (-0.098, 0.01), (-0.3, -1.0)):
         assert force_at(wall, law, y, v) == force_at(plain, base, y, v) > 0.0
+
+
+@pytest.mark.parametrize("theta", [1e-4, 1e-6, 1e-7])
+def test_soft_wall_under_a_bias(theta: float) -> None:
+    stiffness = (theta / 1e-3) ** 2
+    wall = wall_of(Ball(stiffness=stiffness, period=1e-3), "pole_placement")
+    force = force_at(wall, "pole_placement", -1.0, 0.0)
+    assert force == pytest.approx(stiffness, rel=1e-5)

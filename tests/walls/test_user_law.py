@@ -142,6 +142,9 @@ def test_helpers_constants_memory_and_plain_integers(write: Write) -> None:
         ),
         ("def mine(wall):\n    return wall.stifness\n", "KeyError: 'stifness'"),
         ("def mine(wall, y):\n    return y\n", "TypeError: Signature mismatch: 1 argument"),
+        ("import math\nmath.nowhere\n", "AttributeError: module 'math' has no attribute 'nowhere'"),
+        ("OPTIONS = ['a']\ndef mine(wall):\n    return 0.0\n", "OPTIONS "),
+        ("OPTIONS = {'a': 'b'}\ndef mine(wall):\n    return 0.0\n", "OPTIONS "),
         (
             "OPTIONS = dict(a=1, b=2, c=3, d=4, e=5)\ndef mine(wall):\n    return 0.0\n",
             "5 options; a law may have 4",

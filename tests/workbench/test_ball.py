@@ -484,3 +484,12 @@ def test_what_no_ball_can_be(name: str, wrong: float | str) -> None:
     assert message.startswith(f"{name} has to be ")
     assert message.endswith(f"not {wrong!r}" if isinstance(wrong, str) else f"not {wrong:g}")
     assert "\n" not in message
+
+
+@degenerate
+@pytest.mark.parametrize("law", EXACT)
+def test_bounces_shorter_than_a_period(law: str) -> None:
+    ball = Ball(stiffness=1e4, height=0.00125)
+    y, _, _ = sampled_ball(ball, LAWS[law])
+    y_ref, _, _ = continuous_ball(ball)
+    assert y[-1] == pytest.approx(y_ref[-1], rel=0.0, abs=1e-6)
