@@ -112,7 +112,7 @@ def test_missing_file(tmp_path: Path) -> None:
 def test_other_format(tmp_path: Path) -> None:
     path = tmp_path / "drive.xml"
     path.write_text("<eds/>")
-    with pytest.raises(DictionaryError, match="Cannot import"):
+    with pytest.raises(DictionaryError, match="not a readable EDS or DCF: File contains no section headers"):
         Dictionary.load(path, NODE_ID)
 
 
