@@ -157,8 +157,13 @@ class Hand(_Section):
 
 
 class Simulation(_Section):
-    """`[simulation]`: the mechanics of the simulated drive, and the hand on its handle."""
+    """`[simulation]`: the mechanics of the simulated drive, and the hand on its handle.
 
+    Rated torque and encoder are those of the dictionary (0x6076, 0x608F) where it has them.
+    """
+
+    rated_torque_nm: Annotated[Positive, Field(ge=0.001)] = 0.637
+    counts_per_rev: int = Field(131072, gt=0, lt=2**31)
     inertia_kg_m2: Positive = 1.0e-4
     viscous_nm_s_per_rad: NonNegative = 5.0e-4
     coulomb_nm: NonNegative = 0.01

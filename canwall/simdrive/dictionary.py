@@ -180,6 +180,7 @@ class Dictionary:
         self.source = source
         self.node_id = node_id
         self._entries: dict[Key, Entry] = {}
+        self._supplied: dict[Key, int] = {}
         self.dummies: dict[int, int] = {}
         """Sizes in bytes of the data types that an RPDO may map to skip bytes ([DummyUsage])."""
         for variable in variables:
@@ -232,6 +233,24 @@ class Dictionary:
             raise AccessError(AbortCode.NO_SUBINDEX if known else AbortCode.NO_OBJECT)
         return entry
 
+    def supply(self, index: int, subindex: int, value: int) -> None:
+        """Say what the device knows of itself where the EDS is silent.
+
+        It is the power-on value of an entry that has none or zero. Where there is no entry, it is
+        what ``number`` gives the services; the object stays absent from the bus.
+
+        Raises:
+            DictionaryError: the EDS lists it with a type that does not hold the value.
+        """
+        entry = self.number(index, subindex, absent=value)
+        if (index, subindex) not in self:
+            self._supplied[index, subindex] = value
+        elif not entry.default:
+            try:
+                entry.default = entry.value = _power_on_value(entry.codec, value)
+            except OverflowError as error:
+                raise self.error(index, subindex, f"cannot hold {value}") from error
+
     def number(self, index: int, subindex: int = 0, *, absent: int) -> Entry:
         """Return an integer entry that a service works with.
 
@@ -245,7 +264,8 @@ class Dictionary:
         """
         entry = self._entries.get((index, subindex))
         if entry is None:
-            return Entry(index, subindex, None, absent)
+            known = self._supplied.get((index, subindex), absent)
+            return Entry(index, subindex, None, known)
         if not isinstance(entry.default, int):
             raise self.error(index, subindex, "not an integer")
         return entry

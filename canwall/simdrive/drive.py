@@ -23,7 +23,7 @@ _ABORT_CONNECTION = (0x6007, 0)
 
 
 class SimulatedDrive:
-    """A CiA 402 servo drive in cyclic synchronous torque mode: frames in, frames out.
+    """A CiA 402 servo drive in its torque modes: frames in, frames out.
 
     No threads and no clock: SYNC moves the physics, ``tick`` the protocol timers.
     """
@@ -134,7 +134,7 @@ class SimulatedDrive:
         self._axis.state_machine.step()
         for received in self._sync_rpdos:
             received.sync()
-        torque_nm = self._axis.apply_torque()
+        torque_nm = self._axis.apply_torque(self._sync_period_s)
         self._axis.sample()
         for transmitted in self._sync_tpdos:
             transmitted.sync()
