@@ -7,7 +7,11 @@ class AbortCode(IntEnum):
     """Why an SDO transfer ended; every refused write has its own."""
 
     TOGGLE_BIT = 0x05030000
+    TIME_OUT = 0x05040000
     UNKNOWN_COMMAND = 0x05040001
+    INVALID_BLOCK_SIZE = 0x05040002
+    INVALID_SEQUENCE_NUMBER = 0x05040003
+    CRC = 0x05040004
     OUT_OF_MEMORY = 0x05040005
     WRITE_ONLY = 0x06010001
     READ_ONLY = 0x06010002

@@ -56,7 +56,7 @@ class SimulatedDrive:
         self._emcy = EmergencyProducer(dictionary, send)
         self._axis = Axis(dictionary, motion, self._emcy)
         self._sync = SyncConsumer(dictionary, self._route)
-        self._sdo = SdoServer(dictionary, send)
+        self._sdo = SdoServer(dictionary, self._clock, send)
         self._heartbeat_producer = HeartbeatProducer(dictionary, self._clock, send)
         self._heartbeat_consumer = HeartbeatConsumer(
             dictionary, self._clock, self._route, self._heartbeat_lost, self._heartbeat_regained
@@ -99,6 +99,7 @@ class SimulatedDrive:
             self._axis.state_machine.step()
             self._heartbeat_producer.tick(self._nmt.state)
             self._heartbeat_consumer.tick()
+            self._sdo.tick()
             for received in self._rpdos:
                 received.tick()
             for transmitted in self._event_tpdos:

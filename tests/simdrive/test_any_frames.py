@@ -34,7 +34,29 @@ sdo_request = st.tuples(
     st.just(SDO_REQUEST),
     st.builds(
         struct.Struct("<BHBL").pack,
-        st.sampled_from((0x2F, 0x2B, 0x23, 0x22, 0x21, 0x20, 0x40, 0x60, 0x70, 0x00, 0x10, 0x01)),
+        st.sampled_from(
+            (
+                0x2F,
+                0x2B,
+                0x23,
+                0x22,
+                0x21,
+                0x20,
+                0x40,
+                0x60,
+                0x70,
+                0x00,
+                0x10,
+                0x01,
+                0xC6,
+                0xC2,
+                0xC1,
+                0xA4,
+                0xA3,
+                0xA2,
+                0xA1,
+            )
+        ),
         st.sampled_from(OBJECTS),
         st.integers(0, 9),
         st.one_of(
@@ -64,6 +86,7 @@ def test_drive_survives(events: list[tuple[int, bytes] | float]) -> None:
         assert 0 < can_id <= 0x7FF
         assert len(data) <= 8
     bench.nmt(PRE_OPERATIONAL)
+    bench.give(SDO_REQUEST, bytes.fromhex("80 0000 00 00000405"))  # whatever was under way
     assert bench.read(0x1000) == 0x00020192
 
 

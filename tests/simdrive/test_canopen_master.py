@@ -1,5 +1,6 @@
 """canopen's own master drives the simulated drive over python-can's virtual bus."""
 
+import random
 import threading
 import time
 from collections.abc import Callable, Iterator, Sized
@@ -74,6 +75,15 @@ def test_sdo(node: BaseNode402) -> None:
         node.sdo["Statusword"].raw = 0
     with pytest.raises(canopen.SdoAbortedError, match="06090031"):
         node.sdo["Max torque"].raw = 4000
+
+
+@pytest.mark.parametrize("size", [1, 7, 889, 890, 1 << 16])
+def test_block_transfer(node: BaseNode402, size: int) -> None:
+    sent = random.Random(size).randbytes(size)
+    with node.sdo.open(0x2100, 0, "wb", size=size, block_transfer=True) as stream:
+        stream.write(sent)
+    with node.sdo.open(0x2100, 0, "rb", block_transfer=True) as stream:
+        assert stream.read() == sent
 
 
 def test_heartbeat_and_reset(node: BaseNode402) -> None:
