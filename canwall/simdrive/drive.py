@@ -9,6 +9,7 @@ from canwall.simdrive.axis import Axis, Motion
 from canwall.simdrive.dictionary import Dictionary, Key
 from canwall.simdrive.emcy import COMMUNICATION, HEARTBEAT_LOST, EmergencyProducer
 from canwall.simdrive.frame import Clock, Frame
+from canwall.simdrive.guarding import NodeGuarding
 from canwall.simdrive.heartbeat import HeartbeatConsumer, HeartbeatProducer
 from canwall.simdrive.nmt import NmtSlave, NmtState
 from canwall.simdrive.rpdo import Rpdo
@@ -61,6 +62,9 @@ class SimulatedDrive:
         self._heartbeat_consumer = HeartbeatConsumer(
             dictionary, self._clock, self._route, self._heartbeat_lost, self._heartbeat_regained
         )
+        self._guarding = NodeGuarding(
+            dictionary, self._clock, send, self._heartbeat_lost, self._heartbeat_regained
+        )
         self._rpdos = [
             Rpdo(dictionary, index, self._clock, self._emcy, self._route, self._connection_lost)
             for index in dictionary.indices(rpdo.COMMUNICATION)
@@ -92,6 +96,13 @@ class SimulatedDrive:
             transmitted.poll()
         return self._take_outbox()
 
+    def request(self, can_id: int) -> list[Frame]:
+        """Take a remote frame (11-bit identifier) and return the frames that answer it."""
+        respond = self._remote_routes.get(can_id)
+        if respond is not None:
+            respond()
+        return self._take_outbox()
+
     def tick(self, dt: float) -> list[Frame]:
         """Let the protocol timers go on by ``dt`` seconds; return the frames that are due."""
         self._clock.advance(dt)
@@ -99,6 +110,7 @@ class SimulatedDrive:
             self._axis.state_machine.step()
             self._heartbeat_producer.tick(self._nmt.state)
             self._heartbeat_consumer.tick()
+            self._guarding.tick()
             self._sdo.tick()
             for received in self._rpdos:
                 received.tick()
@@ -121,6 +133,7 @@ class SimulatedDrive:
         self._sync_tpdos = [pdo for pdo in tpdos if pdo.synchronous]
         self._event_tpdos = [pdo for pdo in tpdos if not pdo.synchronous]
         routes: dict[int, Receive] = {}
+        remote_routes: dict[int, Callable[[], None]] = {}
         if state is not NmtState.INITIALISATION:
             routes |= _receivers(rpdos)
             routes |= self._heartbeat_consumer.routes()
@@ -129,7 +142,10 @@ class SimulatedDrive:
             # The world does not stand still where NMT wants no SYNC.
             routes[self._sync.can_id] = self._on_sync
             routes[nmt.CAN_ID] = self._nmt.receive
+            remote_routes = {pdo.can_id: pdo.respond for pdo in tpdos if pdo.answers_remote}
+            remote_routes |= self._guarding.routes(state)
         self._routes = routes
+        self._remote_routes = remote_routes
 
     def _on_sync(self, _: bytes) -> None:
         self._axis.state_machine.step()
@@ -162,6 +178,7 @@ class SimulatedDrive:
             self._axis.reset()
         self._sdo.reset()
         self._heartbeat_consumer.reset()
+        self._guarding.reset()
         for pdo in (*self._rpdos, *self._tpdos):
             pdo.configure()
         self._heartbeat_producer.reset()

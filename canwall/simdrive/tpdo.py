@@ -2,8 +2,7 @@
 
 from collections.abc import Callable
 
-from canwall.simdrive.abort import AbortCode, AccessError
-from canwall.simdrive.cob_id import BIT_30, NOT_VALID
+from canwall.simdrive.cob_id import BIT_30
 from canwall.simdrive.dictionary import Dictionary
 from canwall.simdrive.frame import NS_PER_100_US, NS_PER_MS, Clock, Send
 from canwall.simdrive.pdo import CYCLIC, Pdo
@@ -47,6 +46,11 @@ class Tpdo(Pdo):
         self._inhibit_time.check = self._check_inhibit_time
         super().__init__(dictionary, index, index + _MAPPING_OFFSET, changed)
 
+    @property
+    def answers_remote(self) -> bool:
+        """Whether remote frames are answered: bit 30 of the COB-ID is clear."""
+        return not self._cob_id.value & BIT_30
+
     def configure(self) -> None:
         """Compile the mapping and begin anew."""
         super().configure()
@@ -86,6 +90,10 @@ class Tpdo(Pdo):
             self._inhibited_until_ns = now_ns + self._inhibit_ns
             self._transmit(payload)
 
+    def respond(self) -> None:
+        """Answer a remote frame with the present content."""
+        self._transmit(self._payload())
+
     def _payload(self) -> bytes:
         return self._struct.pack(*[entry.value for entry in self._entries])
 
@@ -95,8 +103,3 @@ class Tpdo(Pdo):
 
     def _check_inhibit_time(self, _: int) -> None:
         self._check_not_valid()
-
-    def _check_cob_id(self, value: int) -> None:
-        super()._check_cob_id(value)
-        if not value & (NOT_VALID | BIT_30):
-            raise AccessError(AbortCode.INVALID_VALUE)  # would promise answers to remote frames

@@ -66,6 +66,12 @@ class Bench:
         self.sent += frames
         return frames
 
+    def request(self, can_id: int) -> list[Frame]:
+        """Send a remote frame."""
+        frames = self.drive.request(can_id)
+        self.sent += frames
+        return frames
+
     def tick(self, dt: float = PERIOD_S) -> list[Frame]:
         frames = self.drive.tick(dt)
         self.sent += frames

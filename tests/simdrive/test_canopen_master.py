@@ -213,6 +213,16 @@ def test_poll_handles_all_that_waits_in_order(link: Link) -> None:
     assert seen == [4, 5]
 
 
+def test_node_guarding(node: BaseNode402) -> None:
+    node.nmt.send_command(2)
+    answers: list[int] = []
+    node.network.subscribe(HEARTBEAT, lambda _, data, __: answers.append(data[0]))
+    node.nmt.start_node_guarding(0.001)
+    wait_for(lambda: len(answers) >= 4)
+    node.nmt.stop_node_guarding()
+    assert answers[:4] == [0x04, 0x84, 0x04, 0x84]
+
+
 def test_remote_error_and_extended_frames_are_ignored(link: Link) -> None:
     link.answers()
     read = b"\x40\x00\x10\x00\x00\x00\x00\x00"
