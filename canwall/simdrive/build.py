@@ -22,7 +22,7 @@ def make_drive(
         dictionary.supply(*unit, 1)
     counts = _quotient(dictionary, 0x608F) * _quotient(dictionary, 0x6091)
     motion = ServoMotion(simulation, sync_period_s, counts)
-    return SimulatedDrive(dictionary, drive.node_id, motion, sync_period_s)
+    return SimulatedDrive(dictionary, drive.node_id, motion, sync_period_s, simulation.store)
 
 
 def _quotient(dictionary: Dictionary, index: int) -> float:

@@ -149,7 +149,11 @@ class Entry:
             AccessError: as check_download() and write().
         """
         self.check_download(len(data))
-        self.write(self.codec.unpack(data)[0] if self.codec else data)
+        self.write(self.decode(data))
+
+    def decode(self, data: bytes) -> Any:
+        """Return the value that goes over the bus like this."""
+        return self.codec.unpack(data)[0] if self.codec else data
 
     def write(self, value: Any) -> None:
         """Write a decoded value on behalf of the bus (SDO or RPDO).
@@ -220,6 +224,10 @@ class Dictionary:
             KeyError: the EDS does not have it.
         """
         return self._entries[key]
+
+    def __iter__(self) -> Iterator[Entry]:
+        """Iterate over all entries."""
+        return iter(self._entries.values())
 
     def find(self, index: int, subindex: int) -> Entry:
         """Return the entry that an SDO or a PDO mapping asks for.

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import TypeAlias
 
 from canwall.simdrive import nmt, rpdo, tpdo
@@ -14,6 +15,7 @@ from canwall.simdrive.heartbeat import HeartbeatConsumer, HeartbeatProducer
 from canwall.simdrive.nmt import NmtSlave, NmtState
 from canwall.simdrive.rpdo import Rpdo
 from canwall.simdrive.sdo import SdoServer
+from canwall.simdrive.store import ParameterStore
 from canwall.simdrive.sync import SyncConsumer
 from canwall.simdrive.tpdo import Tpdo
 
@@ -30,7 +32,12 @@ class SimulatedDrive:
     """
 
     def __init__(
-        self, dictionary: Dictionary, node_id: int, motion: Motion, sync_period_s: float
+        self,
+        dictionary: Dictionary,
+        node_id: int,
+        motion: Motion,
+        sync_period_s: float,
+        store: Path | None = None,
     ) -> None:
         """Build the drive; it is dead until ``boot``.
 
@@ -39,6 +46,7 @@ class SimulatedDrive:
             node_id: 1 to 127.
             motion: motor, encoder and hand.
             sync_period_s: time in seconds by which each SYNC moves the physics.
+            store: file that keeps stored parameters (0x1010) beyond the process.
 
         Raises:
             DictionaryError: the dictionary has what no drive can be built from.
@@ -55,6 +63,7 @@ class SimulatedDrive:
         self._outbox: list[Frame] = []
         send = self._outbox.append
         self._emcy = EmergencyProducer(dictionary, send)
+        self._store = ParameterStore(dictionary, store)
         self._axis = Axis(dictionary, motion, self._emcy)
         self._sync = SyncConsumer(dictionary, self._route)
         self._sdo = SdoServer(dictionary, self._clock, send)
@@ -173,6 +182,7 @@ class SimulatedDrive:
         self._axis.disable()
         self._nmt.state = NmtState.INITIALISATION
         self._dictionary.reset(communication_only=communication_only)
+        self._store.load(communication_only=communication_only)
         self._emcy.reset(communication_only=communication_only)
         if not communication_only:
             self._axis.reset()

@@ -55,9 +55,10 @@ class RecordingMotion:
 class Bench:
     """One booted drive, and what a master does to it."""
 
-    def __init__(self, eds: Path = EDS) -> None:
+    def __init__(self, eds: Path = EDS, store: Path | None = None) -> None:
         self.motion = RecordingMotion()
-        self.drive = SimulatedDrive(Dictionary.load(eds, NODE_ID), NODE_ID, self.motion, PERIOD_S)
+        dictionary = Dictionary.load(eds, NODE_ID)
+        self.drive = SimulatedDrive(dictionary, NODE_ID, self.motion, PERIOD_S, store)
         self.sent = self.drive.boot()
         """Every frame that the drive has sent."""
 
