@@ -9,6 +9,7 @@ from canwall.simdrive import nmt, rpdo, tpdo
 from canwall.simdrive.axis import Axis, Motion
 from canwall.simdrive.dictionary import Dictionary, Key
 from canwall.simdrive.emcy import COMMUNICATION, HEARTBEAT_LOST, EmergencyProducer
+from canwall.simdrive.error_behaviour import ErrorBehaviour
 from canwall.simdrive.frame import Clock, Frame
 from canwall.simdrive.guarding import NodeGuarding
 from canwall.simdrive.heartbeat import HeartbeatConsumer, HeartbeatProducer
@@ -65,7 +66,9 @@ class SimulatedDrive:
         self._emcy = EmergencyProducer(dictionary, send)
         self._store = ParameterStore(dictionary, store)
         self._axis = Axis(dictionary, motion, self._emcy)
-        self._sync = SyncConsumer(dictionary, self._route)
+        self._sync = SyncConsumer(
+            dictionary, self._clock, self._emcy, self._route, self._connection_lost
+        )
         self._sdo = SdoServer(dictionary, self._clock, send)
         self._heartbeat_producer = HeartbeatProducer(dictionary, self._clock, send)
         self._heartbeat_consumer = HeartbeatConsumer(
@@ -75,7 +78,15 @@ class SimulatedDrive:
             dictionary, self._clock, send, self._heartbeat_lost, self._heartbeat_regained
         )
         self._rpdos = [
-            Rpdo(dictionary, index, self._clock, self._emcy, self._route, self._connection_lost)
+            Rpdo(
+                dictionary,
+                index,
+                self._clock,
+                self._sync,
+                self._emcy,
+                self._route,
+                self._connection_lost,
+            )
             for index in dictionary.indices(rpdo.COMMUNICATION)
         ]
         self._tpdos = [
@@ -83,6 +94,7 @@ class SimulatedDrive:
             for index in dictionary.indices(tpdo.COMMUNICATION)
         ]
         self._nmt = NmtSlave(node_id, self._leaving, self._entered, self._reset)
+        self._error_behaviour = ErrorBehaviour(dictionary, self._nmt)
         self._route()
 
     def boot(self) -> list[Frame]:
@@ -120,6 +132,7 @@ class SimulatedDrive:
             self._heartbeat_producer.tick(self._nmt.state)
             self._heartbeat_consumer.tick()
             self._guarding.tick()
+            self._sync.tick()
             self._sdo.tick()
             for received in self._rpdos:
                 received.tick()
@@ -156,14 +169,16 @@ class SimulatedDrive:
         self._routes = routes
         self._remote_routes = remote_routes
 
-    def _on_sync(self, _: bytes) -> None:
+    def _on_sync(self, data: bytes) -> None:
+        if not self._sync.receive(data):
+            return
         self._axis.state_machine.step()
         for received in self._sync_rpdos:
             received.sync()
         torque_nm = self._axis.apply_torque(self._sync_period_s)
         self._axis.sample()
         for transmitted in self._sync_tpdos:
-            transmitted.sync()
+            transmitted.sync(self._sync.counter)
         self._motion.advance(torque_nm, self._sync_period_s)
 
     def _leaving(self) -> None:
@@ -172,6 +187,7 @@ class SimulatedDrive:
 
     def _entered(self) -> None:
         self._emcy.silent = self._nmt.state is NmtState.STOPPED
+        self._sync.stop()
         for received in self._rpdos:
             received.stop()
         for transmitted in self._tpdos:
@@ -189,6 +205,7 @@ class SimulatedDrive:
         self._sdo.reset()
         self._heartbeat_consumer.reset()
         self._guarding.reset()
+        self._sync.reset()
         for pdo in (*self._rpdos, *self._tpdos):
             pdo.configure()
         self._heartbeat_producer.reset()
@@ -201,6 +218,7 @@ class SimulatedDrive:
 
     def _heartbeat_lost(self, source: Key) -> None:
         self._connection_lost(HEARTBEAT_LOST, source)
+        self._error_behaviour.communication_error()
 
     def _heartbeat_regained(self, source: Key) -> None:
         self._emcy.gone(HEARTBEAT_LOST, source)
