@@ -213,6 +213,17 @@ class Dictionary:
         od = load_eds(Path(path), node_id)
         return cls(str(path), node_id, _variables(od))
 
+    def renumbered(self, node_id: int) -> "Dictionary":
+        """Return the dictionary of the same device for another node-ID, with power-on values.
+
+        Raises:
+            DictionaryError: the file cannot be read any more.
+        """
+        other = Dictionary.load(self.source, node_id)
+        for key, value in self._supplied.items():
+            other.supply(*key, value)
+        return other
+
     def __contains__(self, key: Key) -> bool:
         """Whether the EDS has the sub-index."""
         return key in self._entries
@@ -251,9 +262,8 @@ class Dictionary:
             DictionaryError: the EDS lists it with a type that does not hold the value.
         """
         entry = self.number(index, subindex, absent=value)
-        if (index, subindex) not in self:
-            self._supplied[index, subindex] = value
-        elif not entry.default:
+        self._supplied[index, subindex] = value
+        if (index, subindex) in self and not entry.default:
             try:
                 entry.default = entry.value = _power_on_value(entry.codec, value)
             except OverflowError as error:

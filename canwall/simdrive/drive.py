@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
-from canwall.simdrive import nmt, rpdo, tpdo
+from canwall.simdrive import lss, nmt, rpdo, tpdo
 from canwall.simdrive.axis import Axis, Motion
 from canwall.simdrive.dictionary import Dictionary, Key
 from canwall.simdrive.emcy import COMMUNICATION, HEARTBEAT_LOST, EmergencyProducer
@@ -13,6 +13,7 @@ from canwall.simdrive.error_behaviour import ErrorBehaviour
 from canwall.simdrive.frame import Clock, Frame
 from canwall.simdrive.guarding import NodeGuarding
 from canwall.simdrive.heartbeat import HeartbeatConsumer, HeartbeatProducer
+from canwall.simdrive.lss import LssSlave
 from canwall.simdrive.nmt import NmtSlave, NmtState
 from canwall.simdrive.rpdo import Rpdo
 from canwall.simdrive.sdo import SdoServer
@@ -57,15 +58,20 @@ class SimulatedDrive:
             raise ValueError(f"node-ID {node_id}, but {dictionary.node_id} in the dictionary")
         if not sync_period_s > 0:
             raise ValueError(f"SYNC period {sync_period_s} s is not positive")
-        self._dictionary = dictionary
         self._motion = motion
         self._sync_period_s = sync_period_s
+        self._store_path = store
+        self._build(dictionary)
+
+    def _build(self, dictionary: Dictionary) -> None:
+        """Build the services on a dictionary, and with its node-ID."""
+        self._dictionary = dictionary
         self._clock = Clock()
         self._outbox: list[Frame] = []
         send = self._outbox.append
         self._emcy = EmergencyProducer(dictionary, send)
-        self._store = ParameterStore(dictionary, store)
-        self._axis = Axis(dictionary, motion, self._emcy)
+        self._store = ParameterStore(dictionary, self._store_path)
+        self._axis = Axis(dictionary, self._motion, self._emcy)
         self._sync = SyncConsumer(
             dictionary, self._clock, self._emcy, self._route, self._connection_lost
         )
@@ -93,7 +99,8 @@ class SimulatedDrive:
             Tpdo(dictionary, index, self._clock, send, self._route)
             for index in dictionary.indices(tpdo.COMMUNICATION)
         ]
-        self._nmt = NmtSlave(node_id, self._leaving, self._entered, self._reset)
+        self._lss = LssSlave(dictionary, send, self._store.keep_node_id)
+        self._nmt = NmtSlave(dictionary.node_id, self._leaving, self._entered, self._reset)
         self._error_behaviour = ErrorBehaviour(dictionary, self._nmt)
         self._route()
 
@@ -163,6 +170,7 @@ class SimulatedDrive:
                 routes[self._sdo.can_id] = self._sdo.receive
             # The world does not stand still where NMT wants no SYNC.
             routes[self._sync.can_id] = self._on_sync
+            routes[lss.CAN_ID] = self._lss.receive
             routes[nmt.CAN_ID] = self._nmt.receive
             remote_routes = {pdo.can_id: pdo.respond for pdo in tpdos if pdo.answers_remote}
             remote_routes |= self._guarding.routes(state)
@@ -196,6 +204,10 @@ class SimulatedDrive:
 
     def _reset(self, communication_only: bool) -> None:
         self._axis.disable()
+        if self._lss.node_id != self._dictionary.node_id:
+            # Another node-ID is another power-on, whichever reset it was.
+            self._build(self._dictionary.renumbered(self._lss.node_id))
+            communication_only = False
         self._nmt.state = NmtState.INITIALISATION
         self._dictionary.reset(communication_only=communication_only)
         self._store.load(communication_only=communication_only)

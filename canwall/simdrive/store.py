@@ -30,6 +30,25 @@ _NOT_PARAMETERS = frozenset((0x1003, _STORE, _RESTORE, 0x6040, 0x6071))
 _IDENTITY = 0x1018
 
 
+def stored_node_id(path: Path) -> int | None:
+    """Return the node-ID that LSS has left in a file, None if there is none.
+
+    Raises:
+        DictionaryError: the file is none that a drive has written.
+    """
+    if not path.exists():
+        return None
+    try:
+        node_id = json.loads(path.read_text(encoding="ascii"))["node_id"]
+    except (OSError, ValueError, TypeError, LookupError) as error:
+        raise _unreadable(path, error) from None
+    return node_id if isinstance(node_id, int) and 1 <= node_id <= 127 else None
+
+
+def _unreadable(path: Path, error: Exception) -> DictionaryError:
+    return DictionaryError(f"{path}: no stored parameters; remove it: {error!r}")
+
+
 class ParameterStore:
     """Values that go before those of the EDS at every reset, until they are restored."""
 
@@ -45,6 +64,7 @@ class ParameterStore:
         """
         self._dictionary = dictionary
         self._path = path
+        self._node_id: int | None = stored_node_id(path) if path else None
         self._stored: dict[Key, bytes] = self._read(path) if path and path.exists() else {}
         for index, signature in ((_STORE, _SAVE), (_RESTORE, _LOAD)):
             for subindex in range(1, 128):
@@ -57,6 +77,15 @@ class ParameterStore:
             if not communication_only or key[0] in _GROUPS[2]:
                 entry = self._dictionary[key]
                 entry.value = entry.decode(data)
+
+    def keep_node_id(self, node_id: int) -> None:
+        """Keep what LSS has configured for the next power-on.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        self._write(self._stored, node_id)
+        self._node_id = node_id
 
     def _serve(self, entry: Entry, signature: int) -> None:
         self._dictionary.supply(*entry.key, _ON_COMMAND)
@@ -72,7 +101,7 @@ class ParameterStore:
         if signature == _SAVE:
             kept |= {entry.key: entry.upload() for entry in self._parameters(group)}
         try:
-            self._write(kept)
+            self._write(kept, self._node_id)
         except OSError as error:
             raise AccessError(AbortCode.HARDWARE) from error
         self._stored = kept
@@ -91,11 +120,12 @@ class ParameterStore:
         numbers = (self._dictionary.number(_IDENTITY, n, absent=0) for n in (1, 2, 3))
         return [number.default for number in numbers]
 
-    def _write(self, stored: dict[Key, bytes]) -> None:
+    def _write(self, stored: dict[Key, bytes], node_id: int | None) -> None:
         if self._path is None:
             return
         objects = {f"{index:04X}:{sub:02X}": data.hex() for (index, sub), data in stored.items()}
-        text = json.dumps({"identity": self._identity(), "objects": objects}, indent=1)
+        content = {"identity": self._identity(), "node_id": node_id, "objects": objects}
+        text = json.dumps(content, indent=1)
         # A drive that dies while it writes keeps what it had.
         draft = self._path.with_name(f"{self._path.name}.new")
         draft.write_text(text, encoding="ascii")
@@ -112,5 +142,5 @@ class ParameterStore:
                 stored[index, subindex] = bytes.fromhex(data)
                 self._dictionary[index, subindex].check_download(len(stored[index, subindex]))
         except (OSError, ValueError, TypeError, AttributeError, LookupError, AccessError) as error:
-            raise DictionaryError(f"{path}: no stored parameters; remove it: {error!r}") from None
+            raise _unreadable(path, error) from None
         return stored

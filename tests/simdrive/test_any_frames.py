@@ -17,6 +17,8 @@ from simdrive_bench import (
     Bench,
 )
 
+LSS_RESPONSE = 0x7E4
+
 OBJECTS = (
     0x1003, 0x1005, 0x1014, 0x1016, 0x1017, 0x1018, 0x1400, 0x1402, 0x1600, 0x1602,
     0x1800, 0x1803, 0x1A00, 0x1A03, 0x6007, 0x6040, 0x605A, 0x605E, 0x6060, 0x6071, 0x6072,
@@ -93,7 +95,7 @@ def test_drive_survives(events: list[tuple[int, bytes] | float]) -> None:
 @settings(max_examples=60, derandomize=True, deadline=None)
 @given(frames=st.lists(st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8)), max_size=60))
 def test_drive_sends_under_its_own_identifiers_only(frames: list[tuple[int, bytes]]) -> None:
-    own = {EMCY, SDO_RESPONSE, HEARTBEAT, *TPDO.values()}
+    own = {EMCY, SDO_RESPONSE, LSS_RESPONSE, HEARTBEAT, *TPDO.values()}
     bench = Bench()
     bench.nmt(1)
     for can_id, data in frames:

@@ -9,6 +9,7 @@ from functools import partial
 import can
 import canopen
 import pytest
+from canopen.lss import LssError
 from canopen.profiles.p402 import BaseNode402
 from simdrive_bench import EDS, HEARTBEAT, NODE_ID, PERIOD_S, RecordingMotion
 
@@ -97,6 +98,24 @@ def test_heartbeat_and_reset(node: BaseNode402) -> None:
     wait_for(lambda: bool(node.nmt.state == "PRE-OPERATIONAL"))
     assert node.sdo["Max torque"].raw == 3000
     assert node.sdo["Producer heartbeat time"].raw == 0
+
+
+def test_lss(node: BaseNode402) -> None:
+    lss = node.network.lss
+    lss.RESPONSE_TIMEOUT = WAIT_S
+    assert lss.send_switch_state_selective(0, 1, 0x00010000, 1)
+    assert [lss.inquire_lss_address(command) for command in range(0x5A, 0x5E)] == [0, 1, 65536, 1]
+    assert lss.inquire_node_id() == NODE_ID
+    lss.configure_node_id(9)
+    lss.store_configuration()
+    with pytest.raises(LssError, match="LSS Error: 1"):
+        lss.configure_bit_timing(0)
+    lss.send_switch_state_global(lss.WAITING_STATE)
+    other = node.network.add_node(BaseNode402(9, str(EDS)))
+    node.nmt.send_command(130)
+    wait_for(lambda: bool(other.nmt.state == "PRE-OPERATIONAL"))
+    other.sdo.RESPONSE_TIMEOUT = WAIT_S
+    assert other.sdo[0x1200][1].raw == 0x609
 
 
 def test_emcy(node: BaseNode402) -> None:

@@ -113,10 +113,10 @@ def test_pdos_are_stored(file: Path) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["", "{}", '{"identity": [0, 1, 65536], "objects": {"1017:00": "00"}}',
-     '{"identity": [0, 1, 65536], "objects": {"2999:00": "00"}}',
-     '{"identity": [0, 1, 65536], "objects": {"6041:00": "0000"}}',
-     '{"identity": [1, 1, 65536], "objects": {}}'],
+    ["", "{}", '{"node_id": null, "identity": [0, 1, 65536], "objects": {"1017:00": "00"}}',
+     '{"node_id": null, "identity": [0, 1, 65536], "objects": {"2999:00": "00"}}',
+     '{"node_id": null, "identity": [0, 1, 65536], "objects": {"6041:00": "0000"}}',
+     '{"node_id": null, "identity": [1, 1, 65536], "objects": {}}'],
 )  # fmt: skip
 def test_file_of_something_else(file: Path, text: str) -> None:
     file.write_text(text)
