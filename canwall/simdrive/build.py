@@ -14,8 +14,8 @@ def make_drive(
     """The drive that the configuration describes, not yet switched on.
 
     Rated torque and encoder are those of its dictionary (0x6076, 0x608F, 0x6091), and those of
-    the simulation where the dictionary has none.
-    A node-ID that LSS has stored goes first. Raises DictionaryError.
+    the simulation where the dictionary has none. A node-ID that LSS has stored goes first.
+    Raises DictionaryError.
     """
     store = simulation.store
     node_id = (stored_node_id(store) if store else None) or drive.node_id
