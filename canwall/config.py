@@ -157,12 +157,24 @@ class Hand(_Section):
 
 
 class Simulation(_Section):
-    """`[simulation]`: the mechanics of the simulated drive, and the hand on its handle."""
+    """`[simulation]`: the mechanics of the simulated drive, and the hand on its handle.
 
+    Rated torque and encoder are those of the dictionary (0x6076, 0x608F) where it has them. What
+    is stored over 0x1010 outlives the drive in the file `store`, if there is one.
+    """
+
+    rated_torque_nm: Annotated[Positive, Field(ge=0.001)] = 0.637
+    counts_per_rev: int = Field(131072, gt=0, lt=2**31)
     inertia_kg_m2: Positive = 1.0e-4
     viscous_nm_s_per_rad: NonNegative = 5.0e-4
     coulomb_nm: NonNegative = 0.01
+    store: Path | None = None
     hand: Hand = Hand()
+
+    @field_validator("store", mode="before")
+    @classmethod
+    def _path(cls, value: object) -> object:
+        return Path(value) if isinstance(value, str) else value
 
 
 class Run(_Section):
@@ -320,7 +332,13 @@ def _with_absolute_paths(settings: Settings, base: Path) -> Settings:
         change.model_copy(update={"law": change.law and absolute_law(change.law, base)})
         for change in settings.schedule
     )
-    return settings.model_copy(update={"drive": drive, "wall": wall, "schedule": schedule})
+    simulation = settings.simulation
+    if simulation is not None and simulation.store is not None:
+        store = (base / simulation.store).resolve()
+        simulation = simulation.model_copy(update={"store": store})
+    return settings.model_copy(
+        update={"drive": drive, "wall": wall, "schedule": schedule, "simulation": simulation}
+    )
 
 
 def absolute_law(law: str, base: Path) -> str:

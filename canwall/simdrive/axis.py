@@ -7,13 +7,17 @@ from canwall.simdrive.emcy import EmergencyProducer
 from canwall.simdrive.state_machine import Command, State, StateMachine
 
 NO_MODE = 0
+PROFILE_TORQUE = 4
 CYCLIC_SYNCHRONOUS_TORQUE = 10
+_TORQUE_MODES = {PROFILE_TORQUE: 1 << 3, CYCLIC_SYNCHRONOUS_TORQUE: 1 << 9}
+"""Modes of operation with their bits in 0x6502."""
 
 _HALT = 1 << 8  # controlword
 
-# Statusword; bit 10 is reserved in cyclic synchronous torque mode.
+# Statusword; bit 10 is reserved in cyclic synchronous torque mode, bit 12 in profile torque mode.
 _VOLTAGE_ENABLED = 1 << 4
 _REMOTE = 1 << 9
+_TARGET_REACHED = 1 << 10
 _INTERNAL_LIMIT_ACTIVE = 1 << 11
 _FOLLOWS_TARGET = 1 << 12
 
@@ -61,16 +65,22 @@ class Axis:
         self._position = number(0x6064, absent=0)
         self._velocity = number(0x606C, absent=0)
         self._target_torque = number(0x6071, absent=0)
+        self._torque_demand = number(0x6074, absent=0)
+        self._torque_slope = number(0x6087, absent=_INT32)
         self._max_torque = number(0x6072, absent=_INT32)
         self._rated_torque = number(0x6076, absent=0)
         self._actual_torque = number(0x6077, absent=0)
         self._positive_limit = number(0x60E0, absent=_INT32)
         self._negative_limit = number(0x60E1, absent=_INT32)
         self._follows_target = False
+        self._ramps = False
+        self._ramp = 0.0
         self._limited = False
+        self._reached = False
         self.state_machine = StateMachine(dictionary, self._refresh)
         self._abort_option.allow((_NO_ACTION, _FAULT, _DISABLE_VOLTAGE, _QUICK_STOP))
-        self._mode.allow((NO_MODE, CYCLIC_SYNCHRONOUS_TORQUE)).react = lambda _: self._refresh()
+        modes = _torque_modes(dictionary)
+        self._mode.allow((NO_MODE, *modes)).react = lambda _: self._refresh()
         self._controlword.react = self._control
 
     def reset(self) -> None:
@@ -101,23 +111,37 @@ class Axis:
         elif option == _QUICK_STOP:
             self.state_machine.command(Command.QUICK_STOP)
 
-    def apply_torque(self) -> float:
-        """Let the target torque take effect; return the torque that applies from now, in N m."""
+    def apply_torque(self, duration_s: float) -> float:
+        """Let the target torque take effect; return the torque that applies from now, in N m.
+
+        Args:
+            duration_s: time for which it will apply, in seconds: a slope goes on by as much.
+        """
         actual = 0
-        limited = False
-        if self._follows_target:
-            target = self._target_torque.value
+        limited = reached = False
+        if self._follows_target or self._ramps:
+            wanted = self._target_torque.value
+            if self._ramps:
+                reached, wanted = self._next_of_ramp(duration_s)
             limit = self._max_torque.value
             highest = min(limit, self._positive_limit.value)
             lowest = -min(limit, self._negative_limit.value)
-            actual = max(lowest, min(highest, target))
-            limited = actual != target
-        self._actual_torque.value = actual
-        if limited is not self._limited:
+            actual = max(lowest, min(highest, wanted))
+            limited = actual != wanted
+        self._actual_torque.value = self._torque_demand.value = actual
+        if limited is not self._limited or reached is not self._reached:
             self._limited = limited
+            self._reached = reached
             self._show_status()
         torque_nm: float = actual * self._rated_torque.value / _PER_MILLE_MILLI
         return torque_nm
+
+    def _next_of_ramp(self, duration_s: float) -> tuple[bool, int]:
+        """Return whether the torque has come where it was to go, and the torque."""
+        end = 0 if self._controlword.value & _HALT else self._target_torque.value
+        step = self._torque_slope.value * duration_s
+        self._ramp += max(-step, min(step, end - self._ramp))
+        return self._ramp == end, round(self._ramp)
 
     def sample(self) -> None:
         """Latch position and velocity."""
@@ -132,14 +156,17 @@ class Axis:
     def _refresh(self) -> None:
         """Follow a change of state, mode or controlword."""
         self._mode_display.value = self._mode.value
-        self._follows_target = (
-            self.state_machine.state is State.OPERATION_ENABLED
-            and self._mode.value == CYCLIC_SYNCHRONOUS_TORQUE
-            and not self._controlword.value & _HALT
-        )
-        if not self._follows_target:
-            self._actual_torque.value = 0
-            self._limited = False
+        enabled = self.state_machine.state is State.OPERATION_ENABLED
+        mode = self._mode.value
+        halted = self._controlword.value & _HALT
+        self._follows_target = enabled and mode == CYCLIC_SYNCHRONOUS_TORQUE and not halted
+        self._ramps = enabled and mode == PROFILE_TORQUE
+        if not self._ramps:
+            self._ramp = 0.0
+            self._reached = False
+            if not self._follows_target:
+                self._actual_torque.value = self._torque_demand.value = 0
+                self._limited = False
         if self._emcy.latched and not self.state_machine.faulty:
             self._emcy.acknowledge()
         self._show_status()
@@ -151,6 +178,24 @@ class Axis:
             status |= _VOLTAGE_ENABLED | _REMOTE
         if self._follows_target:
             status |= _FOLLOWS_TARGET
+        if self._reached:
+            status |= _TARGET_REACHED
         if self._limited:
             status |= _INTERNAL_LIMIT_ACTIVE
         self._statusword.value = status
+
+
+def _torque_modes(dictionary: Dictionary) -> list[int]:
+    """Return the torque modes that the dictionary has.
+
+    They are those of 0x6502. Some vendors leave its value or its torque bits out: then there is
+    cyclic synchronous torque, as the target torque is there, and profile torque if the slope is.
+    """
+    said = dictionary.number(0x6502, absent=0).value
+    modes = [mode for mode, bit in _TORQUE_MODES.items() if said & bit]
+    if not modes:
+        modes = [CYCLIC_SYNCHRONOUS_TORQUE]
+        if (0x6087, 0) in dictionary:
+            modes.append(PROFILE_TORQUE)
+    dictionary.supply(0x6502, 0, sum(_TORQUE_MODES[mode] for mode in modes))
+    return modes

@@ -149,7 +149,11 @@ class Entry:
             AccessError: as check_download() and write().
         """
         self.check_download(len(data))
-        self.write(self.codec.unpack(data)[0] if self.codec else data)
+        self.write(self.decode(data))
+
+    def decode(self, data: bytes) -> Any:
+        """Return the value that goes over the bus like this."""
+        return self.codec.unpack(data)[0] if self.codec else data
 
     def write(self, value: Any) -> None:
         """Write a decoded value on behalf of the bus (SDO or RPDO).
@@ -180,6 +184,7 @@ class Dictionary:
         self.source = source
         self.node_id = node_id
         self._entries: dict[Key, Entry] = {}
+        self._supplied: dict[Key, int] = {}
         self.dummies: dict[int, int] = {}
         """Sizes in bytes of the data types that an RPDO may map to skip bytes ([DummyUsage])."""
         for variable in variables:
@@ -208,6 +213,17 @@ class Dictionary:
         od = load_eds(Path(path), node_id)
         return cls(str(path), node_id, _variables(od))
 
+    def renumbered(self, node_id: int) -> "Dictionary":
+        """Return the dictionary of the same device for another node-ID, with power-on values.
+
+        Raises:
+            DictionaryError: the file cannot be read any more.
+        """
+        other = Dictionary.load(self.source, node_id)
+        for key, value in self._supplied.items():
+            other.supply(*key, value)
+        return other
+
     def __contains__(self, key: Key) -> bool:
         """Whether the EDS has the sub-index."""
         return key in self._entries
@@ -220,6 +236,10 @@ class Dictionary:
         """
         return self._entries[key]
 
+    def __iter__(self) -> Iterator[Entry]:
+        """Iterate over all entries."""
+        return iter(self._entries.values())
+
     def find(self, index: int, subindex: int) -> Entry:
         """Return the entry that an SDO or a PDO mapping asks for.
 
@@ -231,6 +251,23 @@ class Dictionary:
             known = index in self._indices
             raise AccessError(AbortCode.NO_SUBINDEX if known else AbortCode.NO_OBJECT)
         return entry
+
+    def supply(self, index: int, subindex: int, value: int) -> None:
+        """Say what the device knows of itself where the EDS is silent.
+
+        It is the power-on value of an entry that has none or zero. Where there is no entry, it is
+        what ``number`` gives the services; the object stays absent from the bus.
+
+        Raises:
+            DictionaryError: the EDS lists it with a type that does not hold the value.
+        """
+        entry = self.number(index, subindex, absent=value)
+        self._supplied[index, subindex] = value
+        if (index, subindex) in self and not entry.default:
+            try:
+                entry.default = entry.value = _power_on_value(entry.codec, value)
+            except OverflowError as error:
+                raise self.error(index, subindex, f"cannot hold {value}") from error
 
     def number(self, index: int, subindex: int = 0, *, absent: int) -> Entry:
         """Return an integer entry that a service works with.
@@ -245,7 +282,8 @@ class Dictionary:
         """
         entry = self._entries.get((index, subindex))
         if entry is None:
-            return Entry(index, subindex, None, absent)
+            known = self._supplied.get((index, subindex), absent)
+            return Entry(index, subindex, None, known)
         if not isinstance(entry.default, int):
             raise self.error(index, subindex, "not an integer")
         return entry

@@ -2,17 +2,22 @@
 
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import TypeAlias
 
-from canwall.simdrive import nmt, rpdo, tpdo
+from canwall.simdrive import lss, nmt, rpdo, tpdo
 from canwall.simdrive.axis import Axis, Motion
 from canwall.simdrive.dictionary import Dictionary, Key
 from canwall.simdrive.emcy import COMMUNICATION, HEARTBEAT_LOST, EmergencyProducer
+from canwall.simdrive.error_behaviour import ErrorBehaviour
 from canwall.simdrive.frame import Clock, Frame
+from canwall.simdrive.guarding import NodeGuarding
 from canwall.simdrive.heartbeat import HeartbeatConsumer, HeartbeatProducer
+from canwall.simdrive.lss import LssSlave
 from canwall.simdrive.nmt import NmtSlave, NmtState
 from canwall.simdrive.rpdo import Rpdo
 from canwall.simdrive.sdo import SdoServer
+from canwall.simdrive.store import ParameterStore
 from canwall.simdrive.sync import SyncConsumer
 from canwall.simdrive.tpdo import Tpdo
 
@@ -23,13 +28,18 @@ _ABORT_CONNECTION = (0x6007, 0)
 
 
 class SimulatedDrive:
-    """A CiA 402 servo drive in cyclic synchronous torque mode: frames in, frames out.
+    """A CiA 402 servo drive in its torque modes: frames in, frames out.
 
     No threads and no clock: SYNC moves the physics, ``tick`` the protocol timers.
     """
 
     def __init__(
-        self, dictionary: Dictionary, node_id: int, motion: Motion, sync_period_s: float
+        self,
+        dictionary: Dictionary,
+        node_id: int,
+        motion: Motion,
+        sync_period_s: float,
+        store: Path | None = None,
     ) -> None:
         """Build the drive; it is dead until ``boot``.
 
@@ -38,6 +48,7 @@ class SimulatedDrive:
             node_id: 1 to 127.
             motion: motor, encoder and hand.
             sync_period_s: time in seconds by which each SYNC moves the physics.
+            store: file that keeps stored parameters (0x1010) beyond the process.
 
         Raises:
             DictionaryError: the dictionary has what no drive can be built from.
@@ -47,29 +58,50 @@ class SimulatedDrive:
             raise ValueError(f"node-ID {node_id}, but {dictionary.node_id} in the dictionary")
         if not sync_period_s > 0:
             raise ValueError(f"SYNC period {sync_period_s} s is not positive")
-        self._dictionary = dictionary
         self._motion = motion
         self._sync_period_s = sync_period_s
+        self._store_path = store
+        self._build(dictionary)
+
+    def _build(self, dictionary: Dictionary) -> None:
+        """Build the services on a dictionary, and with its node-ID."""
+        self._dictionary = dictionary
         self._clock = Clock()
         self._outbox: list[Frame] = []
         send = self._outbox.append
         self._emcy = EmergencyProducer(dictionary, send)
-        self._axis = Axis(dictionary, motion, self._emcy)
-        self._sync = SyncConsumer(dictionary, self._route)
-        self._sdo = SdoServer(dictionary, send)
+        self._store = ParameterStore(dictionary, self._store_path)
+        self._axis = Axis(dictionary, self._motion, self._emcy)
+        self._sync = SyncConsumer(
+            dictionary, self._clock, self._emcy, self._route, self._connection_lost
+        )
+        self._sdo = SdoServer(dictionary, self._clock, send)
         self._heartbeat_producer = HeartbeatProducer(dictionary, self._clock, send)
         self._heartbeat_consumer = HeartbeatConsumer(
             dictionary, self._clock, self._route, self._heartbeat_lost, self._heartbeat_regained
         )
+        self._guarding = NodeGuarding(
+            dictionary, self._clock, send, self._heartbeat_lost, self._heartbeat_regained
+        )
         self._rpdos = [
-            Rpdo(dictionary, index, self._clock, self._emcy, self._route, self._connection_lost)
+            Rpdo(
+                dictionary,
+                index,
+                self._clock,
+                self._sync,
+                self._emcy,
+                self._route,
+                self._connection_lost,
+            )
             for index in dictionary.indices(rpdo.COMMUNICATION)
         ]
         self._tpdos = [
             Tpdo(dictionary, index, self._clock, send, self._route)
             for index in dictionary.indices(tpdo.COMMUNICATION)
         ]
-        self._nmt = NmtSlave(node_id, self._leaving, self._entered, self._reset)
+        self._lss = LssSlave(dictionary, send, self._store.keep_node_id)
+        self._nmt = NmtSlave(dictionary.node_id, self._leaving, self._entered, self._reset)
+        self._error_behaviour = ErrorBehaviour(dictionary, self._nmt)
         self._route()
 
     def boot(self) -> list[Frame]:
@@ -92,6 +124,13 @@ class SimulatedDrive:
             transmitted.poll()
         return self._take_outbox()
 
+    def request(self, can_id: int) -> list[Frame]:
+        """Take a remote frame (11-bit identifier) and return the frames that answer it."""
+        respond = self._remote_routes.get(can_id)
+        if respond is not None:
+            respond()
+        return self._take_outbox()
+
     def tick(self, dt: float) -> list[Frame]:
         """Let the protocol timers go on by ``dt`` seconds; return the frames that are due."""
         self._clock.advance(dt)
@@ -99,6 +138,9 @@ class SimulatedDrive:
             self._axis.state_machine.step()
             self._heartbeat_producer.tick(self._nmt.state)
             self._heartbeat_consumer.tick()
+            self._guarding.tick()
+            self._sync.tick()
+            self._sdo.tick()
             for received in self._rpdos:
                 received.tick()
             for transmitted in self._event_tpdos:
@@ -120,6 +162,7 @@ class SimulatedDrive:
         self._sync_tpdos = [pdo for pdo in tpdos if pdo.synchronous]
         self._event_tpdos = [pdo for pdo in tpdos if not pdo.synchronous]
         routes: dict[int, Receive] = {}
+        remote_routes: dict[int, Callable[[], None]] = {}
         if state is not NmtState.INITIALISATION:
             routes |= _receivers(rpdos)
             routes |= self._heartbeat_consumer.routes()
@@ -127,17 +170,23 @@ class SimulatedDrive:
                 routes[self._sdo.can_id] = self._sdo.receive
             # The world does not stand still where NMT wants no SYNC.
             routes[self._sync.can_id] = self._on_sync
+            routes[lss.CAN_ID] = self._lss.receive
             routes[nmt.CAN_ID] = self._nmt.receive
+            remote_routes = {pdo.can_id: pdo.respond for pdo in tpdos if pdo.answers_remote}
+            remote_routes |= self._guarding.routes(state)
         self._routes = routes
+        self._remote_routes = remote_routes
 
-    def _on_sync(self, _: bytes) -> None:
+    def _on_sync(self, data: bytes) -> None:
+        if not self._sync.receive(data):
+            return
         self._axis.state_machine.step()
         for received in self._sync_rpdos:
             received.sync()
-        torque_nm = self._axis.apply_torque()
+        torque_nm = self._axis.apply_torque(self._sync_period_s)
         self._axis.sample()
         for transmitted in self._sync_tpdos:
-            transmitted.sync()
+            transmitted.sync(self._sync.counter)
         self._motion.advance(torque_nm, self._sync_period_s)
 
     def _leaving(self) -> None:
@@ -146,6 +195,7 @@ class SimulatedDrive:
 
     def _entered(self) -> None:
         self._emcy.silent = self._nmt.state is NmtState.STOPPED
+        self._sync.stop()
         for received in self._rpdos:
             received.stop()
         for transmitted in self._tpdos:
@@ -154,13 +204,20 @@ class SimulatedDrive:
 
     def _reset(self, communication_only: bool) -> None:
         self._axis.disable()
+        if self._lss.node_id != self._dictionary.node_id:
+            # Another node-ID is another power-on, whichever reset it was.
+            self._build(self._dictionary.renumbered(self._lss.node_id))
+            communication_only = False
         self._nmt.state = NmtState.INITIALISATION
         self._dictionary.reset(communication_only=communication_only)
+        self._store.load(communication_only=communication_only)
         self._emcy.reset(communication_only=communication_only)
         if not communication_only:
             self._axis.reset()
         self._sdo.reset()
         self._heartbeat_consumer.reset()
+        self._guarding.reset()
+        self._sync.reset()
         for pdo in (*self._rpdos, *self._tpdos):
             pdo.configure()
         self._heartbeat_producer.reset()
@@ -173,6 +230,7 @@ class SimulatedDrive:
 
     def _heartbeat_lost(self, source: Key) -> None:
         self._connection_lost(HEARTBEAT_LOST, source)
+        self._error_behaviour.communication_error()
 
     def _heartbeat_regained(self, source: Key) -> None:
         self._emcy.gone(HEARTBEAT_LOST, source)

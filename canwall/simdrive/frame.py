@@ -11,6 +11,7 @@ Send: TypeAlias = Callable[[Frame], None]
 """Hands a frame to the bus."""
 
 NS_PER_MS = 1_000_000
+NS_PER_US = 1_000
 NS_PER_100_US = 100_000
 
 

@@ -15,7 +15,7 @@ CYCLIC = range(1, 241)
 ACYCLIC = 0
 _EVENT_DRIVEN = (254, 255)
 _TRANSMISSION_TYPES = frozenset((ACYCLIC, *CYCLIC, *_EVENT_DRIVEN))
-"""241 to 251 are reserved; 252 and 253 wait for remote frames, which the drive ignores."""
+"""241 to 251 are reserved; 252 and 253, for remote frames only, are not served."""
 
 _MAX_BYTES = 8
 

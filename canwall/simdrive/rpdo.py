@@ -7,6 +7,7 @@ from canwall.simdrive.dictionary import Dictionary, Key
 from canwall.simdrive.emcy import PDO_TOO_SHORT, RPDO_TIMEOUT, EmergencyProducer
 from canwall.simdrive.frame import NS_PER_MS, Clock
 from canwall.simdrive.pdo import Pdo
+from canwall.simdrive.sync import SyncConsumer
 
 COMMUNICATION = range(0x1400, 0x1600)
 _MAPPING_OFFSET = 0x200
@@ -16,6 +17,7 @@ _EVENT_TIMER = 5
 class Rpdo(Pdo):
     """One receive PDO: taken at once (254, 255), or by the next SYNC (0 to 240).
 
+    A synchronous one that comes after the window of 0x1007 is dropped.
     The event timer is a deadline, watched from the first reception on (0x1400:05).
     """
 
@@ -26,6 +28,7 @@ class Rpdo(Pdo):
         dictionary: Dictionary,
         index: int,
         clock: Clock,
+        sync: SyncConsumer,
         emcy: EmergencyProducer,
         changed: Callable[[], None],
         timed_out: Callable[[int, Key], None],
@@ -36,6 +39,7 @@ class Rpdo(Pdo):
             dictionary: has the entries.
             index: of the communication parameter.
             clock: protocol time.
+            sync: knows whether a synchronous PDO has come in time.
             emcy: told of PDOs that are too short, and of the end of a time-out.
             changed: called when the PDO became active or inactive, or moved.
             timed_out: called with error code and (index, sub-index) when the deadline passes.
@@ -44,6 +48,7 @@ class Rpdo(Pdo):
             DictionaryError: as Pdo.
         """
         self._clock = clock
+        self._sync = sync
         self._emcy = emcy
         self._timed_out = timed_out
         self._length_source = (index + _MAPPING_OFFSET, 0)
@@ -74,7 +79,8 @@ class Rpdo(Pdo):
         if self._time_ns:
             self._deadline_ns = self._clock.now_ns + self._time_ns
         if self.synchronous:
-            self._pending = data
+            if self._sync.in_window:
+                self._pending = data
         else:
             self._apply(data)
 

@@ -52,7 +52,10 @@ class BusRunner:
             self._tick()
 
     def _handle(self, message: can.Message) -> None:
-        if message.is_remote_frame or message.is_error_frame or message.is_extended_id:
+        if message.is_error_frame or message.is_extended_id:
+            return
+        if message.is_remote_frame:
+            self._send(self._drive.request(message.arbitration_id))
             return
         self._send(self._drive.process(message.arbitration_id, bytes(message.data)))
 

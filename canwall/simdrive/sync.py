@@ -1,22 +1,57 @@
-"""SYNC consumer (CiA 301, 7.2.5): which CAN-ID the SYNC has."""
+"""SYNC consumer (CiA 301, 7.2.5): identifier, counter, communication cycle and window."""
 
 from collections.abc import Callable
 
 from canwall.simdrive.abort import AbortCode, AccessError
 from canwall.simdrive.cob_id import BIT_30, CAN_ID, check_can_id
-from canwall.simdrive.dictionary import Dictionary
+from canwall.simdrive.dictionary import Dictionary, Key
+from canwall.simdrive.emcy import SYNC_LENGTH, SYNC_LOST, EmergencyProducer
+from canwall.simdrive.frame import NS_PER_US, Clock
 
 _DEFAULT_CAN_ID = 0x080
+_COUNTER_OVERFLOW: Key = (0x1019, 0)
+_CYCLE_PERIOD: Key = (0x1006, 0)
+_OVERFLOW_VALUES = frozenset((0, *range(2, 241)))
 
 
 class SyncConsumer:
-    """Serves 0x1005. The drive never produces SYNC, so bit 30 is refused."""
+    """Serves 0x1005, 0x1006, 0x1007 and 0x1019. The drive never produces SYNC.
 
-    def __init__(self, dictionary: Dictionary, changed: Callable[[], None]) -> None:
-        """Args: dictionary: has the entry; changed: called when the CAN-ID was written."""
+    With a cycle period (0x1006), SYNC is missed when none has come for one and a half periods
+    since the last. With a window (0x1007), what comes later than that after a SYNC is no longer
+    for this cycle. With a counter overflow value (0x1019), SYNC has to carry its counter.
+    """
+
+    def __init__(
+        self,
+        dictionary: Dictionary,
+        clock: Clock,
+        emcy: EmergencyProducer,
+        changed: Callable[[], None],
+        lost: Callable[[int, Key], None],
+    ) -> None:
+        """Serve the objects of the dictionary.
+
+        Args:
+            dictionary: has the entries.
+            clock: protocol time.
+            emcy: told of SYNCs of the wrong length, and of those that come again.
+            changed: called when the CAN-ID was written.
+            lost: called with error code and (index, sub-index) when SYNC is missed.
+        """
+        self._clock = clock
+        self._emcy = emcy
+        self._lost = lost
         self._cob_id = dictionary.number(0x1005, absent=_DEFAULT_CAN_ID)
-        self._cob_id.check = self._check
+        self._period_us = dictionary.number(*_CYCLE_PERIOD, absent=0)
+        self._window_us = dictionary.number(0x1007, absent=0)
+        self._overflow = dictionary.number(*_COUNTER_OVERFLOW, absent=0)
+        self._cob_id.check = self._check_cob_id
         self._cob_id.react = lambda _: changed()
+        self._overflow.check = self._check_overflow
+        for entry in (self._period_us, self._window_us, self._overflow):
+            entry.react = lambda _: self.reset()
+        self.reset()
 
     @property
     def can_id(self) -> int:
@@ -24,7 +59,60 @@ class SyncConsumer:
         can_id: int = self._cob_id.value & CAN_ID
         return can_id
 
-    def _check(self, value: int) -> None:
+    @property
+    def in_window(self) -> bool:
+        """Whether a synchronous PDO that comes now is for this cycle."""
+        end_ns = self._window_end_ns
+        return end_ns is None or self._clock.now_ns <= end_ns
+
+    def reset(self) -> None:
+        """Take the parameters as they stand, and wait for the first SYNC."""
+        self._period_ns = self._period_us.value * NS_PER_US
+        self._window_ns = self._window_us.value * NS_PER_US
+        self._timed = bool(self._period_ns or self._window_ns)
+        self._length = 1 if self._overflow.value else 0
+        self._emcy.gone(SYNC_LOST, _CYCLE_PERIOD)
+        self._emcy.gone(SYNC_LENGTH, _COUNTER_OVERFLOW)
+        self.stop()
+
+    def stop(self) -> None:
+        """Forget the SYNCs that have come."""
+        self.counter = 0
+        """Of the last SYNC; 0: it carries none."""
+        self._deadline_ns: int | None = None
+        self._window_end_ns: int | None = None
+
+    def receive(self, data: bytes) -> bool:
+        """Take a SYNC; return whether it is one, of the length that 0x1019 demands."""
+        if len(data) != self._length:
+            self._emcy.occurred(SYNC_LENGTH, _COUNTER_OVERFLOW)
+            return False
+        if data:
+            self.counter = data[0]
+        if self._emcy.present:
+            self._emcy.gone(SYNC_LENGTH, _COUNTER_OVERFLOW)
+            self._emcy.gone(SYNC_LOST, _CYCLE_PERIOD)
+        if self._timed:
+            now_ns = self._clock.now_ns
+            if self._period_ns:
+                self._deadline_ns = now_ns + self._period_ns * 3 // 2
+            if self._window_ns:
+                self._window_end_ns = now_ns + self._window_ns
+        return True
+
+    def tick(self) -> None:
+        """Report a SYNC that is missed, once."""
+        if self._deadline_ns is not None and self._clock.now_ns >= self._deadline_ns:
+            self._deadline_ns = None
+            self._lost(SYNC_LOST, _CYCLE_PERIOD)
+
+    def _check_cob_id(self, value: int) -> None:
         check_can_id(value)
         if value & BIT_30:
             raise AccessError(AbortCode.INVALID_VALUE)
+
+    def _check_overflow(self, value: int) -> None:
+        if value not in _OVERFLOW_VALUES:
+            raise AccessError(AbortCode.INVALID_VALUE)
+        if self._period_us.value:
+            raise AccessError(AbortCode.DEVICE_STATE)

@@ -3,18 +3,20 @@
 from collections.abc import Callable
 
 from canwall.simdrive.abort import AbortCode, AccessError
-from canwall.simdrive.cob_id import BIT_30, NOT_VALID
+from canwall.simdrive.cob_id import BIT_30
 from canwall.simdrive.dictionary import Dictionary
 from canwall.simdrive.frame import NS_PER_100_US, NS_PER_MS, Clock, Send
 from canwall.simdrive.pdo import CYCLIC, Pdo
 
 COMMUNICATION = range(0x1800, 0x1A00)
 _MAPPING_OFFSET = 0x200
+_HIGHEST_COUNTER = 240
 
 
 class Tpdo(Pdo):
     """One transmit PDO: with every n-th SYNC (1 to 240), or when its content has changed.
 
+    With a SYNC counter, the first of every n-th waits for the SYNC start value (0x1800:06).
     An event is a change of what is mapped. It is sent with the next SYNC (type 0), or at once
     (254, 255), no sooner than the inhibit time after the last; the event timer sends without one.
     """
@@ -45,7 +47,14 @@ class Tpdo(Pdo):
         self._send = send
         self._inhibit_time = dictionary.number(index, 3, absent=0)
         self._inhibit_time.check = self._check_inhibit_time
+        self._start_value = dictionary.number(index, 6, absent=0)
+        self._start_value.check = self._check_start_value
         super().__init__(dictionary, index, index + _MAPPING_OFFSET, changed)
+
+    @property
+    def answers_remote(self) -> bool:
+        """Whether remote frames are answered: bit 30 of the COB-ID is clear."""
+        return not self._cob_id.value & BIT_30
 
     def configure(self) -> None:
         """Compile the mapping and begin anew."""
@@ -60,17 +69,23 @@ class Tpdo(Pdo):
     def start(self) -> None:
         """Begin anew, as on entering OPERATIONAL: the present content counts as an event."""
         self._syncs = 0
+        self._awaited = self._start_value.value
         self._sent: bytes | None = None
         self._event_due_ns = 0
         self._inhibited_until_ns = 0
 
-    def sync(self) -> None:
-        """Send what is due with this SYNC."""
+    def sync(self, counter: int) -> None:
+        """Send what is due with this SYNC, which has a counter or 0."""
         if self._divider is None:
             payload = self._payload()
             if payload != self._sent:
                 self._transmit(payload)
             return
+        if self._awaited and counter:
+            if counter != self._awaited:
+                return
+            self._awaited = 0
+            self._syncs = self._divider - 1
         self._syncs += 1
         if self._syncs >= self._divider:
             self._syncs = 0
@@ -86,6 +101,10 @@ class Tpdo(Pdo):
             self._inhibited_until_ns = now_ns + self._inhibit_ns
             self._transmit(payload)
 
+    def respond(self) -> None:
+        """Answer a remote frame with the present content."""
+        self._transmit(self._payload())
+
     def _payload(self) -> bytes:
         return self._struct.pack(*[entry.value for entry in self._entries])
 
@@ -93,10 +112,10 @@ class Tpdo(Pdo):
         self._sent = payload
         self._send((self._frame_id, payload))
 
+    def _check_start_value(self, value: int) -> None:
+        self._check_not_valid()
+        if value > _HIGHEST_COUNTER:
+            raise AccessError(AbortCode.INVALID_VALUE)
+
     def _check_inhibit_time(self, _: int) -> None:
         self._check_not_valid()
-
-    def _check_cob_id(self, value: int) -> None:
-        super()._check_cob_id(value)
-        if not value & (NOT_VALID | BIT_30):
-            raise AccessError(AbortCode.INVALID_VALUE)  # would promise answers to remote frames

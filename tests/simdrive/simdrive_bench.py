@@ -55,14 +55,21 @@ class RecordingMotion:
 class Bench:
     """One booted drive, and what a master does to it."""
 
-    def __init__(self, eds: Path = EDS) -> None:
+    def __init__(self, eds: Path = EDS, store: Path | None = None) -> None:
         self.motion = RecordingMotion()
-        self.drive = SimulatedDrive(Dictionary.load(eds, NODE_ID), NODE_ID, self.motion, PERIOD_S)
+        dictionary = Dictionary.load(eds, NODE_ID)
+        self.drive = SimulatedDrive(dictionary, NODE_ID, self.motion, PERIOD_S, store)
         self.sent = self.drive.boot()
         """Every frame that the drive has sent."""
 
     def give(self, can_id: int, data: bytes = b"") -> list[Frame]:
         frames = self.drive.process(can_id, data)
+        self.sent += frames
+        return frames
+
+    def request(self, can_id: int) -> list[Frame]:
+        """Send a remote frame."""
+        frames = self.drive.request(can_id)
         self.sent += frames
         return frames
 

@@ -17,6 +17,8 @@ from simdrive_bench import (
     Bench,
 )
 
+LSS_RESPONSE = 0x7E4
+
 OBJECTS = (
     0x1003, 0x1005, 0x1014, 0x1016, 0x1017, 0x1018, 0x1400, 0x1402, 0x1600, 0x1602,
     0x1800, 0x1803, 0x1A00, 0x1A03, 0x6007, 0x6040, 0x605A, 0x605E, 0x6060, 0x6071, 0x6072,
@@ -34,7 +36,29 @@ sdo_request = st.tuples(
     st.just(SDO_REQUEST),
     st.builds(
         struct.Struct("<BHBL").pack,
-        st.sampled_from((0x2F, 0x2B, 0x23, 0x22, 0x21, 0x20, 0x40, 0x60, 0x70, 0x00, 0x10, 0x01)),
+        st.sampled_from(
+            (
+                0x2F,
+                0x2B,
+                0x23,
+                0x22,
+                0x21,
+                0x20,
+                0x40,
+                0x60,
+                0x70,
+                0x00,
+                0x10,
+                0x01,
+                0xC6,
+                0xC2,
+                0xC1,
+                0xA4,
+                0xA3,
+                0xA2,
+                0xA1,
+            )
+        ),
         st.sampled_from(OBJECTS),
         st.integers(0, 9),
         st.one_of(
@@ -64,13 +88,14 @@ def test_drive_survives(events: list[tuple[int, bytes] | float]) -> None:
         assert 0 < can_id <= 0x7FF
         assert len(data) <= 8
     bench.nmt(PRE_OPERATIONAL)
+    bench.give(SDO_REQUEST, bytes.fromhex("80 0000 00 00000405"))  # whatever was under way
     assert bench.read(0x1000) == 0x00020192
 
 
 @settings(max_examples=60, derandomize=True, deadline=None)
 @given(frames=st.lists(st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8)), max_size=60))
 def test_drive_sends_under_its_own_identifiers_only(frames: list[tuple[int, bytes]]) -> None:
-    own = {EMCY, SDO_RESPONSE, HEARTBEAT, *TPDO.values()}
+    own = {EMCY, SDO_RESPONSE, LSS_RESPONSE, HEARTBEAT, *TPDO.values()}
     bench = Bench()
     bench.nmt(1)
     for can_id, data in frames:

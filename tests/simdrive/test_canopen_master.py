@@ -1,5 +1,6 @@
 """canopen's own master drives the simulated drive over python-can's virtual bus."""
 
+import random
 import threading
 import time
 from collections.abc import Callable, Iterator, Sized
@@ -8,6 +9,7 @@ from functools import partial
 import can
 import canopen
 import pytest
+from canopen.lss import LssError
 from canopen.profiles.p402 import BaseNode402
 from simdrive_bench import EDS, HEARTBEAT, NODE_ID, PERIOD_S, RecordingMotion
 
@@ -76,6 +78,15 @@ def test_sdo(node: BaseNode402) -> None:
         node.sdo["Max torque"].raw = 4000
 
 
+@pytest.mark.parametrize("size", [1, 7, 889, 890, 1 << 16])
+def test_block_transfer(node: BaseNode402, size: int) -> None:
+    sent = random.Random(size).randbytes(size)
+    with node.sdo.open(0x2100, 0, "wb", size=size, block_transfer=True) as stream:
+        stream.write(sent)
+    with node.sdo.open(0x2100, 0, "rb", block_transfer=True) as stream:
+        assert stream.read() == sent
+
+
 def test_heartbeat_and_reset(node: BaseNode402) -> None:
     node.sdo["Producer heartbeat time"].raw = 5
     node.nmt.wait_for_heartbeat(WAIT_S)
@@ -87,6 +98,24 @@ def test_heartbeat_and_reset(node: BaseNode402) -> None:
     wait_for(lambda: bool(node.nmt.state == "PRE-OPERATIONAL"))
     assert node.sdo["Max torque"].raw == 3000
     assert node.sdo["Producer heartbeat time"].raw == 0
+
+
+def test_lss(node: BaseNode402) -> None:
+    lss = node.network.lss
+    lss.RESPONSE_TIMEOUT = WAIT_S
+    assert lss.send_switch_state_selective(0, 1, 0x00010000, 1)
+    assert [lss.inquire_lss_address(command) for command in range(0x5A, 0x5E)] == [0, 1, 65536, 1]
+    assert lss.inquire_node_id() == NODE_ID
+    lss.configure_node_id(9)
+    lss.store_configuration()
+    with pytest.raises(LssError, match="LSS Error: 1"):
+        lss.configure_bit_timing(0)
+    lss.send_switch_state_global(lss.WAITING_STATE)
+    other = node.network.add_node(BaseNode402(9, str(EDS)))
+    node.nmt.send_command(130)
+    wait_for(lambda: bool(other.nmt.state == "PRE-OPERATIONAL"))
+    other.sdo.RESPONSE_TIMEOUT = WAIT_S
+    assert other.sdo[0x1200][1].raw == 0x609
 
 
 def test_emcy(node: BaseNode402) -> None:
@@ -201,6 +230,16 @@ def test_poll_handles_all_that_waits_in_order(link: Link) -> None:
     link.runner.poll()
     seen = [data[4] for can_id, data in link.answers() if can_id == 0x585]
     assert seen == [4, 5]
+
+
+def test_node_guarding(node: BaseNode402) -> None:
+    node.nmt.send_command(2)
+    answers: list[int] = []
+    node.network.subscribe(HEARTBEAT, lambda _, data, __: answers.append(data[0]))
+    node.nmt.start_node_guarding(0.001)
+    wait_for(lambda: len(answers) >= 4)
+    node.nmt.stop_node_guarding()
+    assert answers[:4] == [0x04, 0x84, 0x04, 0x84]
 
 
 def test_remote_error_and_extended_frames_are_ignored(link: Link) -> None:

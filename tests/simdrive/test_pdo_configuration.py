@@ -83,7 +83,6 @@ REFUSED: dict[str, tuple[str, Callable[[Bench], None]]] = {
     "CAN-ID of a valid PDO": (DEVICE_STATE, write(0x1800, 1, NO_RTR | 0x1A5, 4)),
     "inhibit time of a valid PDO": (DEVICE_STATE, write(0x1800, 3, 10, 2)),
     "valid with nothing mapped": (DEVICE_STATE, invalid_pdo(write(0x1400, 1, RPDO[1], 4))),
-    "TPDO that allows RTR": (INVALID_VALUE, write(0x1800, 1, TPDO[1], 4)),
     "29-bit identifier": (INVALID_VALUE, write(0x1403, 1, 0x20000505, 4)),
     "identifier of the SDO": (INVALID_VALUE, write(0x1403, 1, 0x605, 4)),
     "identifier of NMT": (INVALID_VALUE, write(0x1403, 1, 0x000, 4)),

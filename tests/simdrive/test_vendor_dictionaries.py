@@ -1,0 +1,167 @@
+"""The drive with the dictionaries of drives that can be bought."""
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import canopen
+import pytest
+from canopen import SdoAbortedError
+from simdrive_bench import (
+    CONTROLWORD,
+    NO_RTR,
+    NODE_ID,
+    NOT_VALID,
+    POSITION,
+    RPDO,
+    START,
+    STATUSWORD,
+    TARGET_TORQUE,
+    TPDO,
+    Bench,
+)
+
+from canwall.config import Drive as DriveSettings
+from canwall.config import Simulation
+from canwall.eds import load_eds
+from canwall.simdrive import make_drive
+
+FOLDER = Path(__file__).parents[3] / "shared" / "vendor-eds"
+
+
+@dataclass(frozen=True)
+class Vendor:
+    """A file, and what its drive is to be like."""
+
+    file: str
+    modes: tuple[int, ...]
+    lacks: tuple[int, ...]
+    rated_torque_mnm: float
+    counts_per_rev: float
+
+
+VENDORS = [
+    Vendor("maxon_epos4_0x1018.eds", (10,), (0x6072, 0x608F, 0x6091), 1250, 4000),
+    Vendor("elmo_gold.dcf", (10, 4), (0x1005, 0x1007), 1250, 1),
+    Vendor("nanotec_C5-E-2-09.eds", (10, 4), (0x6076, 0x60E0), 1250, 4000),
+    Vendor("technosoft_iPOS.D.v1.04.eds", (10,), (0x1016, 0x6072, 0x6076), 1250, 4000),
+    Vendor("ingenia_eve-net-c_1.8.1.eds", (10,), (0x1016, 0x6087), 1000, 4000),
+]
+SIMULATION = Simulation(rated_torque_nm=1.25, counts_per_rev=4000)
+
+
+@pytest.fixture(params=VENDORS, ids=lambda vendor: vendor.file)
+def vendor(request: pytest.FixtureRequest) -> Vendor:
+    assert isinstance(request.param, Vendor)
+    if not (FOLDER / request.param.file).is_file():
+        pytest.skip(f"{FOLDER} has no {request.param.file}")
+    return request.param
+
+
+class VendorBench(Bench):
+    """A drive as the configuration describes it, with one of the dictionaries."""
+
+    def __init__(self, vendor: Vendor) -> None:
+        self.path = FOLDER / vendor.file
+        settings = DriveSettings(node_id=NODE_ID, eds=self.path)
+        self.drive = make_drive(settings, SIMULATION, 0.001)
+        self.sent = self.drive.boot()
+
+
+@pytest.fixture
+def of_vendor(vendor: Vendor) -> VendorBench:
+    return VendorBench(vendor)
+
+
+def test_keeps_exactly_that_dictionary(vendor: Vendor, of_vendor: VendorBench) -> None:
+    od = load_eds(of_vendor.path, NODE_ID)
+    for index in (*range(0x1000, 0x1030), *range(0x6000, 0x6600), *vendor.lacks):
+        request = struct.pack("<BHB4x", 0x40, index, 0)
+        try:
+            of_vendor.sdo(request)
+        except SdoAbortedError as abort:
+            assert (abort.code == 0x06020000) == (index not in od)  # noqa: PT017
+        else:
+            assert index in od
+    assert not any(index in od for index in vendor.lacks)
+
+
+def readable(od: canopen.ObjectDictionary) -> list[tuple[int, int]]:
+    """Objects up to 32 bits long that may be read."""
+    variables: list[canopen.objectdictionary.ODVariable] = []
+    for item in od.values():
+        variables += item.values() if hasattr(item, "subindices") else [item]
+    types = (*range(1, 8),)
+    return [
+        (one.index, one.subindex)
+        for one in variables
+        if one.index >= 0x1000 and one.data_type in types and one.access_type != "wo"
+    ]
+
+
+def test_answers_sdo(of_vendor: VendorBench) -> None:
+    no_error_yet = 0x1003
+    for key in readable(load_eds(of_vendor.path, NODE_ID)):
+        if key[0] != no_error_yet:
+            of_vendor.read(*key)
+
+
+def configure(bench: Bench, index: int, cob_id: int, mapping: list[int]) -> None:
+    """Set up a PDO that every SYNC moves, in the order of CiA 301."""
+    bench.write(index, 1, cob_id | NOT_VALID, 4)
+    bench.write(index + 0x200, 0, 0, 1)
+    for place, mapped in enumerate(mapping, start=1):
+        bench.write(index + 0x200, place, mapped, 4)
+    bench.write(index + 0x200, 0, len(mapping), 1)
+    bench.write(index, 2, 1, 1)
+    bench.write(index, 1, cob_id, 4)
+
+
+def test_is_enabled_and_driven(vendor: Vendor, of_vendor: VendorBench) -> None:
+    bench = of_vendor
+    bench.tick()
+    configure(bench, 0x1400, RPDO[1], [CONTROLWORD, TARGET_TORQUE])
+    configure(bench, 0x1800, NO_RTR | TPDO[1], [STATUSWORD, POSITION])
+    bench.nmt(START)
+    for mode in vendor.modes:
+        torque = 50
+        bench.write(0x6060, 0, mode, 1)
+        assert bench.read(0x6061) == mode
+        if mode == 4:
+            bench.write(0x6087, 0, 25_000, 4)
+        for controlword in (0x06, 0x07, 0x0F, 0x0F, 0x0F):
+            bench.give(RPDO[1], struct.pack("<Hh", controlword, torque))
+            frames = dict(bench.sync())
+        status, _ = struct.unpack("<Hi", frames[TPDO[1]])
+        assert status & 0x6F == 0x27
+        assert bench.read(0x6077) == torque
+        bench.give(RPDO[1], struct.pack("<Hh", 0x00, 0))
+        bench.sync()
+    assert {code for code, _ in bench.emergencies()} == set()
+
+
+@pytest.mark.parametrize("mode", [1, 3, 6, 7, 8, 9])
+def test_modes_without_torque_are_refused(of_vendor: VendorBench, mode: int) -> None:
+    with pytest.raises(SdoAbortedError, match="06090030"):
+        of_vendor.write(0x6060, 0, mode, 1)
+
+
+def test_supported_modes_are_shown(vendor: Vendor, of_vendor: VendorBench) -> None:
+    shown = of_vendor.read(0x6502)
+    if load_eds(of_vendor.path, NODE_ID)[0x6502].default is None:
+        assert shown == sum(1 << mode - 1 for mode in vendor.modes)
+
+
+def test_units(vendor: Vendor, of_vendor: VendorBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = of_vendor
+    torques: list[float] = []
+    motion = bench.drive._motion
+    monkeypatch.setattr(motion, "advance", lambda torque_nm, _: torques.append(torque_nm))
+    bench.enable()
+    bench.write(0x6071, 0, 100, 2)
+    bench.sync()
+    assert torques[-1] == pytest.approx(0.1 * vendor.rated_torque_mnm / 1000)
+    turn = SIMULATION.hand.rest_rad / 6.283185307179586
+    assert bench.read(0x6064) == pytest.approx(turn * vendor.counts_per_rev, abs=0.51)
+    if vendor.rated_torque_mnm == 1250 and 0x6076 not in vendor.lacks:
+        assert bench.read(0x6076) == 1250
