@@ -255,7 +255,7 @@ def _strike_table(strikes: list[dict[str, Any]]) -> Table:
             f"{strike['stiffness']:g}",
             str(strike["contacts"]),
             f"{strike['peak_penetration_rad'] * 1e3:.2f}",
-            f"{strike['energy_out_j'] * 1e3:.2f}",
+            f"{strike['energy_out_j'] * 1e3:z.2f}",
             chatter,
         )
     return table
