@@ -6,6 +6,7 @@ first. Its last words go to standard output as JSON: what was written and what w
 
 import contextlib
 import json
+import os
 import select
 import sys
 from pathlib import Path
@@ -100,8 +101,9 @@ def main() -> None:
         while not select.select([sys.stdin], [], [], _POLL_S)[0]:
             ring.take_frames()
             ring.take_rows()
+    # Not through the stream: what it could not get rid of it would complain about at exit.
     with contextlib.suppress(BrokenPipeError):
-        print(json.dumps({"error": error}), flush=True)
+        os.write(sys.stdout.fileno(), json.dumps({"error": error}).encode())
 
 
 if __name__ == "__main__":
