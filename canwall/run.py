@@ -14,6 +14,7 @@ from typing import Any
 import can
 import numpy as np
 import pyarrow as pa
+from canopen.objectdictionary import ObjectDictionary
 from numpy.typing import NDArray
 
 from canwall import simdrive
@@ -101,6 +102,11 @@ def serve_drive(settings: Settings, stop: Callable[[], bool], joined: Callable[[
         runner.run(stop)
 
 
+def drive_dictionary(settings: Settings) -> ObjectDictionary:
+    """The object dictionary of `[drive]`, with all that a wall needs. Raises DictionaryError."""
+    return load_eds(settings.drive.eds, settings.drive.node_id, REQUIRED_OBJECTS)
+
+
 @dataclass(frozen=True)
 class Bench:
     """A drive that is set up, and the cycle that will render the wall on it."""
@@ -111,12 +117,17 @@ class Bench:
     exchange: PythonCanExchange
 
 
-def set_up_bench(link: Link, settings: Settings, laws: Sequence[Law], ring: Ring) -> Bench:
+def set_up_bench(
+    link: Link,
+    settings: Settings,
+    dictionary: ObjectDictionary,
+    laws: Sequence[Law],
+    ring: Ring,
+) -> Bench:
     """Set the drive up for its wall, the rows of its cycles going into the ring.
 
-    Nothing is enabled yet. Raises DictionaryError, DriveError.
+    `dictionary` is what `[drive] eds` describes. Nothing is enabled yet. Raises DriveError.
     """
-    dictionary = load_eds(settings.drive.eds, settings.drive.node_id, REQUIRED_OBJECTS)
     node = DriveNode(link, settings.drive.node_id, dictionary)
     setup = set_up(node, settings.drive)
     cycle = make_cycle(settings, setup, laws)
@@ -171,7 +182,7 @@ def run(
     be set up, RunFailedError where no cycle came about or none was recorded.
     """
     laws = run_laws(settings)
-    load_eds(settings.drive.eds, settings.drive.node_id, REQUIRED_OBJECTS)
+    dictionary = drive_dictionary(settings)
     with on_the_bus(settings) as link:
         folder = RunFolder.create(output)
         folder.config.write_text(settings.to_toml(), encoding="utf-8")
@@ -180,7 +191,7 @@ def run(
         try:
             link.log = recorder.ring.log_frame
             report("setting up the drive")
-            bench = set_up_bench(link, settings, laws, recorder.ring)
+            bench = set_up_bench(link, settings, dictionary, laws, recorder.ring)
             report("rendering")
             with stop_on_signals() as stop:
                 outcome = render(

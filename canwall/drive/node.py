@@ -8,6 +8,7 @@ from canopen.objectdictionary import ObjectDictionary, datatypes
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from canwall.drive.link import Link
+from canwall.drive.objects import DEVICE_TYPE
 from canwall.errors import RunFailedError
 
 
@@ -80,7 +81,7 @@ class DriveNode:
         deadline = time.monotonic() + timeout_s
         while True:
             try:
-                self.read(0x1000)
+                self.read(DEVICE_TYPE)
                 return
             except DriveError:
                 if time.monotonic() >= deadline:

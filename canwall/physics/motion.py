@@ -12,7 +12,6 @@ continuous referent that every law is compared with (a wall of stiffness K and d
 import math
 
 import numpy as np
-from numba import from_dtype
 from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
@@ -31,7 +30,6 @@ PLANT = np.dtype(
     ],
     align=True,
 )
-PLANT_TYPE = from_dtype(PLANT)
 
 #: Events within one call beyond which the motion is taken for lost and returned as NaN rather
 #: than followed for ever. A period of a servo loop has a handful.

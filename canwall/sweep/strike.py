@@ -8,7 +8,14 @@ from numpy.typing import NDArray
 from canwall import metrics
 from canwall.config import Hand, Mechanics, Settings, Simulation, Wall
 from canwall.record import Ring
-from canwall.run import on_the_bus, referent_positions, render, run_laws, set_up_bench
+from canwall.run import (
+    drive_dictionary,
+    on_the_bus,
+    referent_positions,
+    render,
+    run_laws,
+    set_up_bench,
+)
 from canwall.units import DriveUnits
 
 Array = NDArray[np.float64]
@@ -131,7 +138,7 @@ def strike_over_bus(settings: Settings) -> Verdict:
 
     try:
         with on_the_bus(settings) as link:
-            bench = set_up_bench(link, settings, laws, ring)
+            bench = set_up_bench(link, settings, drive_dictionary(settings), laws, ring)
             outcome = render(bench, settings, laws, lambda: False, collect)
         collect(0.0)
     finally:

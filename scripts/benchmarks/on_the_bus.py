@@ -24,7 +24,14 @@ from canwall.cycle.step import start_at
 from canwall.drive import REQUIRED_OBJECTS, DriveNode, DriveSetup, Link, set_up
 from canwall.eds import load_eds
 from canwall.record import ROW, Phase, Recorder, Ring
-from canwall.run import make_simulated_drive, on_the_bus, render, run_laws, set_up_bench
+from canwall.run import (
+    drive_dictionary,
+    make_simulated_drive,
+    on_the_bus,
+    render,
+    run_laws,
+    set_up_bench,
+)
 
 _REPEATS = 7
 #: Cycles of one turn; a ring without a reader holds them.
@@ -58,7 +65,7 @@ def _rate_of_run(settings: Settings) -> float:
     with tempfile.TemporaryDirectory() as folder, on_the_bus(settings) as link:
         recorder = Recorder(Path(folder), "bus.log", "bench", [law.name for law in laws])
         link.log = recorder.ring.log_frame
-        bench = set_up_bench(link, settings, laws, recorder.ring)
+        bench = set_up_bench(link, settings, drive_dictionary(settings), laws, recorder.ring)
         begin = time.perf_counter()
         outcome = render(bench, settings, laws, stop=lambda: False)
         duration = time.perf_counter() - begin
