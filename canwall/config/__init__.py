@@ -1,0 +1,37 @@
+"""Settings of a run: one TOML file, validated, immutable, in SI units.
+
+Every key carries its unit in its name. What is unknown, misspelt, of the wrong type or impossible
+is a `ConfigError` of one line: file, key, what is wrong, what to do.
+"""
+
+from canwall.config.reading import ConfigError, absolute_law, load, shipped
+from canwall.config.settings import (
+    Bus,
+    Change,
+    Drive,
+    Estimator,
+    Limits,
+    Mechanics,
+    Run,
+    Settings,
+    Wall,
+)
+from canwall.config.simulation import Hand, Simulation
+
+__all__ = [
+    "Bus",
+    "Change",
+    "ConfigError",
+    "Drive",
+    "Estimator",
+    "Hand",
+    "Limits",
+    "Mechanics",
+    "Run",
+    "Settings",
+    "Simulation",
+    "Wall",
+    "absolute_law",
+    "load",
+    "shipped",
+]

@@ -1,0 +1,157 @@
+"""From the file to the settings, or to the one line that says what is wrong with it."""
+
+import difflib
+import math
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, get_args
+
+from pydantic import BaseModel, ValidationError
+
+from canwall.config.settings import Settings
+from canwall.errors import InputError
+
+
+class ConfigError(InputError):
+    """A configuration that cannot be used."""
+
+
+# Lengths and forces at a handle of radius r are angles and torques at its shaft: [wall] may be
+# written in either. The exponent of r takes the metric value to the angular one.
+_AT_THE_HANDLE = {
+    "position_m": ("position_rad", -1),
+    "stiffness_n_per_m": ("stiffness_nm_per_rad", 2),
+    "damping_n_s_per_m": ("damping_nm_s_per_rad", 2),
+}
+
+
+def _at_the_shaft(raw: dict[str, Any]) -> None:
+    """Turn what is written at the handle; what is of the wrong type is left to the validation."""
+    mechanics, schedule = raw.get("mechanics"), raw.get("schedule")
+    radius = mechanics.get("handle_radius_m") if isinstance(mechanics, dict) else None
+    if not isinstance(radius, int | float) or not radius > 0:
+        return
+    changes = schedule if isinstance(schedule, list) else []
+    sections = {"wall": raw.get("wall")} | {f"schedule.{i}": c for i, c in enumerate(changes)}
+    for name, section in sections.items():
+        if not isinstance(section, dict):
+            continue
+        for metric, (angular, exponent) in _AT_THE_HANDLE.items():
+            if metric not in section:
+                continue
+            if angular in section:
+                raise ConfigError(f"{name}.{metric}: {angular} is given as well; keep one of them")
+            value = section.pop(metric)
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise ConfigError(f"{name}.{metric}: has to be a valid number, not {_shown(value)}")
+            section[angular] = value * float(radius) ** exponent
+
+
+def load(path: Path, overrides: Mapping[str, Any] | None = None) -> Settings:
+    """Read and validate a TOML file; `overrides` maps dotted keys to values that go first.
+
+    Paths in the file are relative to the file. Raises ConfigError.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; give the path of a configuration") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from None
+    try:
+        raw = tomllib.loads(text)
+    except ValueError as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from None
+    try:
+        _at_the_shaft(raw)
+        for dotted, value in (overrides or {}).items():
+            section, key = dotted.split(".")
+            table = raw.setdefault(section, {})
+            if isinstance(table, dict):
+                table[key] = value
+        settings = Settings.model_validate(raw)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {_first_error(error, raw)}") from None
+    return _with_absolute_paths(settings, path.parent)
+
+
+def _with_absolute_paths(settings: Settings, base: Path) -> Settings:
+    """The files that a configuration names, independent of where it lies."""
+    drive = settings.drive.model_copy(update={"eds": (base / settings.drive.eds).resolve()})
+    wall = settings.wall.model_copy(update={"law": absolute_law(settings.wall.law, base)})
+    schedule = tuple(
+        change.model_copy(update={"law": change.law and absolute_law(change.law, base)})
+        for change in settings.schedule
+    )
+    simulation = settings.simulation
+    if simulation is not None and simulation.store is not None:
+        store = (base / simulation.store).resolve()
+        simulation = simulation.model_copy(update={"store": store})
+    return settings.model_copy(
+        update={"drive": drive, "wall": wall, "schedule": schedule, "simulation": simulation}
+    )
+
+
+def absolute_law(law: str, base: Path) -> str:
+    """A law's name; where it names a user's file, that file's path no longer relative to base."""
+    path, colon, function = law.rpartition(":")
+    return f"{(base / path).resolve()}:{function}" if colon else law
+
+
+# What the validation calls by the names of Python, in those of TOML.
+_IN_TOML = {
+    "model_type": "a table",
+    "dict_type": "a table",
+    "tuple_type": "an array",
+    "too_long": "a pair",
+    "is_instance_of": "a path in quotes",
+}
+
+
+def _first_error(error: ValidationError, raw: Mapping[str, Any]) -> str:
+    """One line for the first thing that is wrong: key, what, what to do."""
+    first = error.errors()[0]
+    where = [str(part) for part in first["loc"]]
+    key = ".".join(where)
+    given = first["input"]
+    if first["type"] == "extra_forbidden":
+        return f"{key}: unknown key{_suggestion(where)}"
+    if first["type"] == "missing":
+        return f"{key}: is missing; add it"
+    message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    if not key:
+        return message
+    if first["type"] == "value_error":
+        return f"{key}: {message}"
+    return f"{key}: has to be {_IN_TOML.get(first['type'], message)}, not {_shown(given)}"
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return repr(value) if isinstance(value, str | int | float | bool) else type(value).__name__
+
+
+def _suggestion(where: list[str]) -> str:
+    model: Any = Settings
+    for part in where[:-1]:
+        if part.isdigit():
+            continue
+        annotation = model.model_fields[part].annotation
+        candidates = [annotation, *get_args(annotation)]
+        model = next(c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel))
+    known = list(model.model_fields)
+    if where[-1] in _AT_THE_HANDLE:
+        return "; lengths and forces at the handle need mechanics.handle_radius_m"
+    close = difflib.get_close_matches(where[-1], known, n=1, cutoff=0.5)
+    return f"; did you mean {close[0]}?" if close else f"; known here: {', '.join(known)}"
+
+
+def shipped(relative: str) -> Path:
+    """A file that comes with the project, e.g. `config/sim.toml`, in a checkout or installed."""
+    package = Path(__file__).resolve().parents[1]
+    installed = package / "data" / relative
+    return installed if installed.exists() else package.parent / relative

@@ -1,0 +1,176 @@
+"""The sections of a configuration, and what they say together."""
+
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+import tomli_w
+from pydantic import Field, field_validator, model_validator
+
+from canwall.config.section import NonNegative, Number, Positive, Section
+from canwall.config.simulation import Simulation
+
+
+class Bus(Section):
+    """`[bus]`: where the drive is, and how long one period of the SYNC is."""
+
+    interface: str = "virtual"
+    channel: str = "canwall"
+    bitrate: int = Field(1_000_000, gt=0)
+    cycle_s: Annotated[Positive, Field(le=1.0)] = 0.001
+    pace: Literal["auto", "real_time", "simulated"] = "auto"
+
+
+class Drive(Section):
+    """`[drive]`: which node, described by which EDS or DCF."""
+
+    node_id: int = Field(ge=1, le=127)
+    eds: Path
+    mode: Literal["auto", "cst"] = "auto"
+    rated_torque_nm: Positive | None = None
+    counts_per_rev: Positive | None = None
+    gear_ratio: Positive | None = None
+    wait_s: NonNegative = 5.0
+
+    @field_validator("eds", mode="before")
+    @classmethod
+    def _path(cls, value: object) -> object:
+        return Path(value) if isinstance(value, str) else value
+
+
+class Mechanics(Section):
+    """`[mechanics]`: the model of everything that moves, as the laws use it."""
+
+    inertia_kg_m2: Positive
+    viscous_nm_s_per_rad: NonNegative = 0.0
+    coulomb_nm: NonNegative = 0.0
+    spring_nm_per_rad: NonNegative = 0.0
+    handle_radius_m: Positive | None = None
+
+
+class Wall(Section):
+    """`[wall]`: where it is, how stiff, and by which law it is rendered."""
+
+    law: str = "half_sample"
+    position_rad: Number = 0.0
+    side: Literal["below", "above"] = "below"
+    stiffness_nm_per_rad: NonNegative = 50.0
+    damping_nm_s_per_rad: NonNegative = 0.0
+    deadbeat: bool = False
+    velocity: Literal["difference", "estimated"] = "difference"
+    options: dict[str, Number] = Field(default_factory=dict)
+    tension: Literal["allow", "clamp", "budget"] = "allow"
+    passivity_nm_s_per_rad: NonNegative = 0.0
+
+
+class Estimator(Section):
+    """`[estimator]`: how fast the operator's force may change, for the Kalman filter."""
+
+    force_walk_nm_per_sqrt_s: Annotated[Positive, Field(ge=1e-4, le=100.0)] = 0.2
+
+
+class Limits(Section):
+    """`[limits]`: torque is held to its limit; speed and position beyond theirs end the run."""
+
+    torque_nm: Positive
+    speed_rad_s: Positive = 60.0
+    position_rad: tuple[Number, Number] = (-3.0, 3.0)
+    hold_cycles: int = Field(2, ge=0, le=100)
+    ramp_cycles: int = Field(10, ge=1, le=1000)
+
+    @field_validator("position_rad", mode="before")
+    @classmethod
+    def _pair(cls, value: object) -> object:
+        return tuple(value) if isinstance(value, list) else value
+
+    @field_validator("position_rad")
+    @classmethod
+    def _ordered(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if not value[0] < value[1]:
+            raise ValueError("the lower limit has to come first and lie below the upper one")
+        return value
+
+
+class Run(Section):
+    """`[run]`: how long, and in which format the bus log is kept."""
+
+    duration_s: Positive | None = None
+    bus_log: Literal["bus.log", "bus.asc", "bus.blf", "bus.csv", "bus.trc", "bus.db"] = "bus.log"
+
+
+class Change(Section):
+    """`[[schedule]]`: from at_s on, these keys of `[wall]` have these values."""
+
+    at_s: NonNegative
+    law: str | None = None
+    position_rad: Number | None = None
+    stiffness_nm_per_rad: NonNegative | None = None
+    damping_nm_s_per_rad: NonNegative | None = None
+    deadbeat: bool | None = None
+    velocity: Literal["difference", "estimated"] | None = None
+    options: dict[str, Number] | None = None
+    tension: Literal["allow", "clamp", "budget"] | None = None
+    passivity_nm_s_per_rad: NonNegative | None = None
+
+
+class Settings(Section):
+    """Everything that one run needs to know."""
+
+    bus: Bus = Bus()
+    drive: Drive
+    mechanics: Mechanics
+    wall: Wall = Wall()
+    estimator: Estimator = Estimator()
+    limits: Limits
+    run: Run = Run()
+    simulation: Simulation | None = None
+    schedule: tuple[Change, ...] = ()
+
+    @field_validator("schedule", mode="before")
+    @classmethod
+    def _changes(cls, value: object) -> object:
+        return tuple(value) if isinstance(value, list) else value
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if [c.at_s for c in self.schedule] != sorted(c.at_s for c in self.schedule):
+            raise ValueError("schedule: the entries have to be in the order of at_s")
+        low, high = self.limits.position_rad
+        sections = ("wall", *(f"schedule.{i}" for i in range(len(self.schedule))))
+        for section, (_, wall) in zip(sections, self.walls, strict=True):
+            if not low < wall.position_rad < high:
+                raise ValueError(
+                    f"{section}.position_rad = {wall.position_rad:g} lies outside "
+                    f"limits.position_rad = [{low:g}, {high:g}]"
+                )
+        return self
+
+    @property
+    def walls(self) -> list[tuple[float, Wall]]:
+        """The wall in force from each instant on: (at_s, wall), the first at 0."""
+        timeline = [(0.0, self.wall)]
+        for change in self.schedule:
+            update = change.model_dump(exclude={"at_s"}, exclude_none=True)
+            if change.law is not None:
+                update.setdefault("options", {})  # they were the other law's
+            timeline.append((change.at_s, timeline[-1][1].model_copy(update=update)))
+        return timeline
+
+    @property
+    def embedded(self) -> bool:
+        """Whether the simulated drive lives in the same process as the master.
+
+        python-can's virtual bus ends at the process; on every other bus the simulated drive is a
+        process of its own (`canwall drive`).
+        """
+        return self.simulation is not None and self.bus.interface == "virtual"
+
+    @property
+    def real_time(self) -> bool:
+        """Whether SYNCs keep to the wall clock, or go out as fast as the simulation answers."""
+        if self.bus.pace == "auto":
+            return self.simulation is None
+        return self.bus.pace == "real_time"
+
+    def to_toml(self) -> str:
+        """The settings as a TOML file that `load` reads back to the same settings."""
+        return tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))

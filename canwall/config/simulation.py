@@ -1,0 +1,57 @@
+"""`[simulation]`: the mechanics of the simulated drive, and the hand on its handle."""
+
+from pathlib import Path
+from typing import Annotated, Self
+
+from pydantic import Field, field_validator, model_validator
+
+from canwall.config.section import NonNegative, Number, Positive, Section
+
+
+class Hand(Section):
+    """`[simulation.hand]`: a mass, spring and damper about a hand that strikes by script."""
+
+    inertia_kg_m2: NonNegative = 6.4e-5
+    damping_nm_s_per_rad: NonNegative = 0.0256
+    stiffness_nm_per_rad: NonNegative = 3.2
+    strikes: int = Field(4, ge=0)
+    first_strike_s: NonNegative = 0.2
+    interval_s: Positive = 1.0
+    rest_rad: Number = 0.1
+    press_rad: Number = -0.1
+    press_torque_nm: Number = 0.0
+    approach_s: Positive = 0.1
+    press_s: NonNegative = 0.5
+    withdraw_s: Positive = 0.1
+
+    @model_validator(mode="after")
+    def _strikes_fit(self) -> Self:
+        lasts = self.approach_s + self.press_s + self.withdraw_s
+        # Strikes may follow one another without a rest: 0.1 + 0.1 + 0.1 fits into 0.3.
+        if self.strikes > 1 and lasts > self.interval_s * (1.0 + 1e-9):
+            raise ValueError(
+                f"a strike lasts {lasts:g} s (approach_s + press_s + withdraw_s) and does not fit "
+                f"into interval_s = {self.interval_s:g}"
+            )
+        return self
+
+
+class Simulation(Section):
+    """`[simulation]`: the mechanics of the simulated drive, and the hand on its handle.
+
+    Rated torque and encoder are those of the dictionary (0x6076, 0x608F) where it has them. What
+    is stored over 0x1010 outlives the drive in the file `store`, if there is one.
+    """
+
+    rated_torque_nm: Annotated[Positive, Field(ge=0.001)] = 0.637
+    counts_per_rev: int = Field(131072, gt=0, lt=2**31)
+    inertia_kg_m2: Positive = 1.0e-4
+    viscous_nm_s_per_rad: NonNegative = 5.0e-4
+    coulomb_nm: NonNegative = 0.01
+    store: Path | None = None
+    hand: Hand = Hand()
+
+    @field_validator("store", mode="before")
+    @classmethod
+    def _path(cls, value: object) -> object:
+        return Path(value) if isinstance(value, str) else value
