@@ -87,7 +87,8 @@ def make_simulated_drive(settings: Settings) -> simdrive.SimulatedDrive:
     """
     if settings.simulation is None:
         raise ConfigError("[simulation] is missing: there is no drive to simulate")
-    return simdrive.make_drive(settings.drive, settings.simulation, settings.bus.cycle_s)
+    bus = settings.bus
+    return simdrive.make_drive(settings.drive, settings.simulation, bus.cycle_s, bus.bitrate)
 
 
 def serve_drive(settings: Settings, stop: Callable[[], bool], joined: Callable[[], None]) -> None:

@@ -3,30 +3,33 @@
 from canwall.config import Drive as DriveSettings
 from canwall.config import Simulation
 from canwall.simdrive.dictionary import Dictionary
-from canwall.simdrive.drive import SimulatedDrive
+from canwall.simdrive.drive import DEFAULT_BITRATE, SimulatedDrive
+from canwall.simdrive.memory import UNCONFIGURED, Memory
 from canwall.simdrive.motion import ServoMotion
-from canwall.simdrive.store import stored_node_id
 
 
 def make_drive(
-    drive: DriveSettings, simulation: Simulation, sync_period_s: float
+    drive: DriveSettings,
+    simulation: Simulation,
+    sync_period_s: float,
+    bitrate: int = DEFAULT_BITRATE,
 ) -> SimulatedDrive:
     """The drive that the configuration describes, not yet switched on.
 
     Rated torque and encoder are those of its dictionary (0x6076, 0x608F, 0x6091), and those of
     the simulation where the dictionary has none. A node-ID that LSS has stored goes first.
-    Raises DictionaryError.
+    `bitrate` [bit/s] is that of the bus. Raises DictionaryError.
     """
-    store = simulation.store
-    node_id = (stored_node_id(store) if store else None) or drive.node_id
-    dictionary = Dictionary.load(drive.eds, node_id)
+    memory = Memory(simulation.store)
+    node_id = memory.node_id or drive.node_id
+    dictionary = Dictionary.load(drive.eds, drive.node_id if node_id == UNCONFIGURED else node_id)
     dictionary.supply(0x6076, 0, round(1000.0 * simulation.rated_torque_nm))
     dictionary.supply(0x608F, 1, simulation.counts_per_rev)
     for unit in ((0x608F, 2), (0x6091, 1), (0x6091, 2)):
         dictionary.supply(*unit, 1)
     counts = _quotient(dictionary, 0x608F) * _quotient(dictionary, 0x6091)
     motion = ServoMotion(simulation, sync_period_s, counts)
-    return SimulatedDrive(dictionary, node_id, motion, sync_period_s, store)
+    return SimulatedDrive(dictionary, node_id, motion, sync_period_s, memory, bitrate)
 
 
 def _quotient(dictionary: Dictionary, index: int) -> float:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import TypeAlias
 
 from canwall.simdrive import lss, nmt, rpdo, tpdo
@@ -10,10 +9,11 @@ from canwall.simdrive.axis import Axis, Motion
 from canwall.simdrive.dictionary import Dictionary, Key
 from canwall.simdrive.emcy import COMMUNICATION, HEARTBEAT_LOST, EmergencyProducer
 from canwall.simdrive.error_behaviour import ErrorBehaviour
-from canwall.simdrive.frame import Clock, Frame
+from canwall.simdrive.frame import NS_PER_MS, Clock, Frame
 from canwall.simdrive.guarding import NodeGuarding
 from canwall.simdrive.heartbeat import HeartbeatConsumer, HeartbeatProducer
 from canwall.simdrive.lss import LssSlave
+from canwall.simdrive.memory import UNCONFIGURED, Memory
 from canwall.simdrive.nmt import NmtSlave, NmtState
 from canwall.simdrive.rpdo import Rpdo
 from canwall.simdrive.sdo import SdoServer
@@ -23,6 +23,9 @@ from canwall.simdrive.tpdo import Tpdo
 
 Receive: TypeAlias = Callable[[bytes], None]
 """Takes the data of the frames with one CAN-ID."""
+
+DEFAULT_BITRATE = 1_000_000
+"""Bit/s."""
 
 _ABORT_CONNECTION = (0x6007, 0)
 
@@ -39,38 +42,43 @@ class SimulatedDrive:
         node_id: int,
         motion: Motion,
         sync_period_s: float,
-        store: Path | None = None,
+        memory: Memory | None = None,
+        bitrate: int = DEFAULT_BITRATE,
     ) -> None:
         """Build the drive; it is dead until ``boot``.
 
         Args:
             dictionary: object dictionary, loaded for this node-ID; the drive takes it over.
-            node_id: 1 to 127.
+            node_id: 1 to 127, or UNCONFIGURED: then LSS alone has to give it one.
             motion: motor, encoder and hand.
             sync_period_s: time in seconds by which each SYNC moves the physics.
-            store: file that keeps stored parameters (0x1010) beyond the process.
+            memory: what keeps stored parameters (0x1010) and the node-ID of LSS.
+            bitrate: of the bus, in bit/s.
 
         Raises:
             DictionaryError: the dictionary has what no drive can be built from.
             ValueError: the node-ID is not that of the dictionary, or the period not positive.
         """
-        if node_id != dictionary.node_id:
+        if node_id not in (dictionary.node_id, UNCONFIGURED):
             raise ValueError(f"node-ID {node_id}, but {dictionary.node_id} in the dictionary")
         if not sync_period_s > 0:
             raise ValueError(f"SYNC period {sync_period_s} s is not positive")
         self._motion = motion
         self._sync_period_s = sync_period_s
-        self._store_path = store
-        self._build(dictionary)
+        self._memory = memory or Memory(None)
+        self._bitrate = bitrate
+        self._build(dictionary, node_id)
 
-    def _build(self, dictionary: Dictionary) -> None:
-        """Build the services on a dictionary, and with its node-ID."""
+    def _build(self, dictionary: Dictionary, node_id: int) -> None:
+        """Build the services on a dictionary, and with its node-ID unless there is none."""
         self._dictionary = dictionary
+        self._node_id = node_id
+        self._silent_until_ns = 0
         self._clock = Clock()
         self._outbox: list[Frame] = []
         send = self._outbox.append
         self._emcy = EmergencyProducer(dictionary, send)
-        self._store = ParameterStore(dictionary, self._store_path)
+        self._store = ParameterStore(dictionary, self._memory)
         self._axis = Axis(dictionary, self._motion, self._emcy)
         self._sync = SyncConsumer(
             dictionary, self._clock, self._emcy, self._route, self._connection_lost
@@ -99,7 +107,15 @@ class SimulatedDrive:
             Tpdo(dictionary, index, self._clock, send, self._route)
             for index in dictionary.indices(tpdo.COMMUNICATION)
         ]
-        self._lss = LssSlave(dictionary, send, self._store.keep_node_id)
+        self._lss = LssSlave(
+            dictionary,
+            node_id,
+            self._bitrate,
+            send,
+            partial(self._memory.store_node_id, dictionary),
+            partial(self._reset, False),
+            self._fall_silent,
+        )
         self._nmt = NmtSlave(dictionary.node_id, self._leaving, self._entered, self._reset)
         self._error_behaviour = ErrorBehaviour(dictionary, self._nmt)
         self._route()
@@ -150,7 +166,10 @@ class SimulatedDrive:
     def _take_outbox(self) -> list[Frame]:
         frames = self._outbox.copy()
         self._outbox.clear()
-        return frames
+        return frames if self._clock.now_ns >= self._silent_until_ns else []
+
+    def _fall_silent(self, duration_ms: int) -> None:
+        self._silent_until_ns = self._clock.now_ns + duration_ms * NS_PER_MS
 
     def _route(self) -> None:
         """Settle who takes what: every change of NMT state or of a COB-ID ends here."""
@@ -160,7 +179,7 @@ class SimulatedDrive:
         tpdos = [pdo for pdo in self._tpdos if operational and pdo.active]
         self._sync_rpdos = [pdo for pdo in rpdos if pdo.synchronous]
         self._sync_tpdos = [pdo for pdo in tpdos if pdo.synchronous]
-        self._event_tpdos = [pdo for pdo in tpdos if not pdo.synchronous]
+        self._event_tpdos = [pdo for pdo in tpdos if pdo.event_driven]
         routes: dict[int, Receive] = {}
         remote_routes: dict[int, Callable[[], None]] = {}
         if state is not NmtState.INITIALISATION:
@@ -170,10 +189,12 @@ class SimulatedDrive:
                 routes[self._sdo.can_id] = self._sdo.receive
             # The world does not stand still where NMT wants no SYNC.
             routes[self._sync.can_id] = self._on_sync
-            routes[lss.CAN_ID] = self._lss.receive
             routes[nmt.CAN_ID] = self._nmt.receive
+            routes[lss.CAN_ID] = self._lss.receive
             remote_routes = {pdo.can_id: pdo.respond for pdo in tpdos if pdo.answers_remote}
             remote_routes |= self._guarding.routes(state)
+        elif self._node_id == UNCONFIGURED:
+            routes = {lss.CAN_ID: self._lss.receive, self._sync.can_id: self._on_sync}
         self._routes = routes
         self._remote_routes = remote_routes
 
@@ -204,9 +225,11 @@ class SimulatedDrive:
 
     def _reset(self, communication_only: bool) -> None:
         self._axis.disable()
-        if self._lss.node_id != self._dictionary.node_id:
+        node_id = self._lss.node_id
+        if node_id != self._node_id:
             # Another node-ID is another power-on, whichever reset it was.
-            self._build(self._dictionary.renumbered(self._lss.node_id))
+            known = self._dictionary.node_id if node_id == UNCONFIGURED else node_id
+            self._build(self._dictionary.renumbered(known), node_id)
             communication_only = False
         self._nmt.state = NmtState.INITIALISATION
         self._dictionary.reset(communication_only=communication_only)
@@ -221,6 +244,11 @@ class SimulatedDrive:
         for pdo in (*self._rpdos, *self._tpdos):
             pdo.configure()
         self._heartbeat_producer.reset()
+        if self._node_id == UNCONFIGURED:
+            # CiA 305: the initialisation goes on when LSS has given it a node-ID.
+            self._emcy.silent = True
+            self._route()
+            return
         self._heartbeat_producer.boot_up()
         self._nmt.enter(NmtState.PRE_OPERATIONAL)
 

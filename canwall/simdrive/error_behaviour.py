@@ -3,17 +3,23 @@
 from canwall.simdrive.dictionary import Dictionary
 from canwall.simdrive.nmt import NmtSlave, NmtState
 
-_PRE_OPERATIONAL, _NO_CHANGE, _STOPPED = range(3)
+_REACTIONS = range(3)
+_PRE_OPERATIONAL, _NO_CHANGE, _STOPPED = _REACTIONS
 
 
 class ErrorBehaviour:
-    """Serves 0x1029:01. A drive without it goes to PRE-OPERATIONAL, as CiA 301 has it."""
+    """Serves 0x1029. A drive without it goes to PRE-OPERATIONAL, as CiA 301 has it.
+
+    Sub-index 1 is for errors of the communication. The others are for those of the device.
+    """
 
     def __init__(self, dictionary: Dictionary, nmt: NmtSlave) -> None:
         """Args: dictionary: has the entry; nmt: the state that changes."""
         self._nmt = nmt
         self._class = dictionary.number(0x1029, 1, absent=_PRE_OPERATIONAL)
-        self._class.allow((_PRE_OPERATIONAL, _NO_CHANGE, _STOPPED))
+        for subindex in range(1, 255):
+            if (0x1029, subindex) in dictionary:
+                dictionary.number(0x1029, subindex, absent=_NO_CHANGE).allow(_REACTIONS)
 
     def communication_error(self) -> None:
         """React to a heartbeat or life guarding event, or a bus-off."""

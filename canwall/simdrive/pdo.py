@@ -13,9 +13,11 @@ from canwall.simdrive.dictionary import Dictionary, Entry
 
 CYCLIC = range(1, 241)
 ACYCLIC = 0
-_EVENT_DRIVEN = (254, 255)
-_TRANSMISSION_TYPES = frozenset((ACYCLIC, *CYCLIC, *_EVENT_DRIVEN))
-"""241 to 251 are reserved; 252 and 253, for remote frames only, are not served."""
+SYNCHRONOUS_REMOTE, EVENT_DRIVEN_REMOTE = 252, 253
+"""Sent when a remote frame asks for it, and then alone."""
+EVENT_DRIVEN = (254, 255)
+_TRANSMISSION_TYPES = frozenset((ACYCLIC, *CYCLIC, *EVENT_DRIVEN))
+"""241 to 251 are reserved."""
 
 _MAX_BYTES = 8
 
@@ -51,7 +53,8 @@ class Pdo:
         self._changed = changed
         self._cob_id = dictionary.number(communication, 1, absent=NOT_VALID)
         self._type = dictionary.number(communication, 2, absent=255)
-        self._type.allow(_TRANSMISSION_TYPES)
+        remote = (SYNCHRONOUS_REMOTE, EVENT_DRIVEN_REMOTE) if self.transmit else ()
+        self._type.allow(_TRANSMISSION_TYPES.union(remote))
         self._event_time = dictionary.number(communication, 5, absent=0)
         self._count = dictionary.number(mapping, 0, absent=0)
         self._mapping = [
@@ -89,7 +92,7 @@ class Pdo:
     @property
     def synchronous(self) -> bool:
         """Whether SYNC moves the PDO."""
-        return self._type.value not in _EVENT_DRIVEN
+        return self._type.value not in (EVENT_DRIVEN_REMOTE, *EVENT_DRIVEN)
 
     def configure(self) -> None:
         """Compile the mapping of an active PDO; called whenever a parameter has changed.

@@ -1,13 +1,11 @@
-"""Store and restore parameters (CiA 301, 7.5.2.13 and 7.5.2.14), in a file."""
+"""Store and restore parameters (CiA 301, 7.5.2.13 and 7.5.2.14)."""
 
-import json
 from collections.abc import Iterator
 from functools import partial
-from pathlib import Path
 
-from canwall.eds import DictionaryError
 from canwall.simdrive.abort import AbortCode, AccessError
-from canwall.simdrive.dictionary import Dictionary, Entry, Key
+from canwall.simdrive.dictionary import Dictionary, Entry
+from canwall.simdrive.memory import Memory
 
 _STORE = 0x1010
 _RESTORE = 0x1011
@@ -27,45 +25,23 @@ _MANUFACTURER = range(0x2000, 0x6000)
 _NOT_PARAMETERS = frozenset((0x1003, _STORE, _RESTORE, 0x6040, 0x6071))
 """History, commands and targets: whatever was stored, nothing moves by itself after power-on."""
 
-_IDENTITY = 0x1018
-
-
-def stored_node_id(path: Path) -> int | None:
-    """Return the node-ID that LSS has left in a file, None if there is none.
-
-    Raises:
-        DictionaryError: the file is none that a drive has written.
-    """
-    if not path.exists():
-        return None
-    try:
-        node_id = json.loads(path.read_text(encoding="ascii"))["node_id"]
-    except (OSError, ValueError, TypeError, LookupError) as error:
-        raise _unreadable(path, error) from None
-    return node_id if isinstance(node_id, int) and 1 <= node_id <= 127 else None
-
-
-def _unreadable(path: Path, error: Exception) -> DictionaryError:
-    return DictionaryError(f"{path}: no stored parameters; remove it: {error!r}")
-
 
 class ParameterStore:
     """Values that go before those of the EDS at every reset, until they are restored."""
 
-    def __init__(self, dictionary: Dictionary, path: Path | None) -> None:
+    def __init__(self, dictionary: Dictionary, memory: Memory) -> None:
         """Serve 0x1010 and 0x1011 of the dictionary.
 
         Args:
             dictionary: has the entries.
-            path: where the values outlive the process; None: nowhere. It need not exist yet.
+            memory: what keeps the values.
 
         Raises:
-            DictionaryError: the file is none that a drive with this dictionary has written.
+            DictionaryError: the memory holds the values of another device.
         """
         self._dictionary = dictionary
-        self._path = path
-        self._node_id: int | None = stored_node_id(path) if path else None
-        self._stored: dict[Key, bytes] = self._read(path) if path and path.exists() else {}
+        self._memory = memory
+        self._stored = memory.parameters(dictionary)
         for index, signature in ((_STORE, _SAVE), (_RESTORE, _LOAD)):
             for subindex in range(1, 128):
                 if (index, subindex) in dictionary:
@@ -77,15 +53,6 @@ class ParameterStore:
             if not communication_only or key[0] in _GROUPS[2]:
                 entry = self._dictionary[key]
                 entry.value = entry.decode(data)
-
-    def keep_node_id(self, node_id: int) -> None:
-        """Keep what LSS has configured for the next power-on.
-
-        Raises:
-            OSError: the file cannot be written.
-        """
-        self._write(self._stored, node_id)
-        self._node_id = node_id
 
     def _serve(self, entry: Entry, signature: int) -> None:
         self._dictionary.supply(*entry.key, _ON_COMMAND)
@@ -101,7 +68,7 @@ class ParameterStore:
         if signature == _SAVE:
             kept |= {entry.key: entry.upload() for entry in self._parameters(group)}
         try:
-            self._write(kept, self._node_id)
+            self._memory.store(self._dictionary, kept)
         except OSError as error:
             raise AccessError(AbortCode.HARDWARE) from error
         self._stored = kept
@@ -115,32 +82,3 @@ class ParameterStore:
                 and entry.value is not None
             ):
                 yield entry
-
-    def _identity(self) -> list[int]:
-        numbers = (self._dictionary.number(_IDENTITY, n, absent=0) for n in (1, 2, 3))
-        return [number.default for number in numbers]
-
-    def _write(self, stored: dict[Key, bytes], node_id: int | None) -> None:
-        if self._path is None:
-            return
-        objects = {f"{index:04X}:{sub:02X}": data.hex() for (index, sub), data in stored.items()}
-        content = {"identity": self._identity(), "node_id": node_id, "objects": objects}
-        text = json.dumps(content, indent=1)
-        # A drive that dies while it writes keeps what it had.
-        draft = self._path.with_name(f"{self._path.name}.new")
-        draft.write_text(text, encoding="ascii")
-        draft.replace(self._path)
-
-    def _read(self, path: Path) -> dict[Key, bytes]:
-        try:
-            content = json.loads(path.read_text(encoding="ascii"))
-            if content["identity"] != self._identity():
-                raise DictionaryError(f"{path}: stored by another device; remove it")
-            stored: dict[Key, bytes] = {}
-            for name, data in content["objects"].items():
-                index, subindex = (int(part, 16) for part in name.split(":"))
-                stored[index, subindex] = bytes.fromhex(data)
-                self._dictionary[index, subindex].check_download(len(stored[index, subindex]))
-        except (OSError, ValueError, TypeError, AttributeError, LookupError, AccessError) as error:
-            raise _unreadable(path, error) from None
-        return stored

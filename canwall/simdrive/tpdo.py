@@ -6,7 +6,7 @@ from canwall.simdrive.abort import AbortCode, AccessError
 from canwall.simdrive.cob_id import BIT_30
 from canwall.simdrive.dictionary import Dictionary
 from canwall.simdrive.frame import NS_PER_100_US, NS_PER_MS, Clock, Send
-from canwall.simdrive.pdo import CYCLIC, Pdo
+from canwall.simdrive.pdo import CYCLIC, EVENT_DRIVEN, SYNCHRONOUS_REMOTE, Pdo
 
 COMMUNICATION = range(0x1800, 0x1A00)
 _MAPPING_OFFSET = 0x200
@@ -16,6 +16,8 @@ _HIGHEST_COUNTER = 240
 class Tpdo(Pdo):
     """One transmit PDO: with every n-th SYNC (1 to 240), or when its content has changed.
 
+    Or only when a remote frame asks for it, with the content of the last SYNC (252) or the present
+    one (253). Others answer remote frames as well, while bit 30 of their COB-ID is clear.
     With a SYNC counter, the first of every n-th waits for the SYNC start value (0x1800:06).
     An event is a change of what is mapped. It is sent with the next SYNC (type 0), or at once
     (254, 255), no sooner than the inhibit time after the last; the event timer sends without one.
@@ -56,6 +58,11 @@ class Tpdo(Pdo):
         """Whether remote frames are answered: bit 30 of the COB-ID is clear."""
         return not self._cob_id.value & BIT_30
 
+    @property
+    def event_driven(self) -> bool:
+        """Whether a change of the content is sent at once."""
+        return self._type.value in EVENT_DRIVEN
+
     def configure(self) -> None:
         """Compile the mapping and begin anew."""
         super().configure()
@@ -64,6 +71,7 @@ class Tpdo(Pdo):
         self._frame_id = self.can_id
         # How many SYNCs make one transmission; None: an event does.
         self._divider = self._type.value if self._type.value in CYCLIC else None
+        self._sampled = self._type.value == SYNCHRONOUS_REMOTE
         self.start()
 
     def start(self) -> None:
@@ -71,6 +79,7 @@ class Tpdo(Pdo):
         self._syncs = 0
         self._awaited = self._start_value.value
         self._sent: bytes | None = None
+        self._sample = self._payload()
         self._event_due_ns = 0
         self._inhibited_until_ns = 0
 
@@ -78,7 +87,9 @@ class Tpdo(Pdo):
         """Send what is due with this SYNC, which has a counter or 0."""
         if self._divider is None:
             payload = self._payload()
-            if payload != self._sent:
+            if self._sampled:
+                self._sample = payload
+            elif payload != self._sent:
                 self._transmit(payload)
             return
         if self._awaited and counter:
@@ -102,8 +113,8 @@ class Tpdo(Pdo):
             self._transmit(payload)
 
     def respond(self) -> None:
-        """Answer a remote frame with the present content."""
-        self._transmit(self._payload())
+        """Answer a remote frame."""
+        self._transmit(self._sample if self._sampled else self._payload())
 
     def _payload(self) -> bytes:
         return self._struct.pack(*[entry.value for entry in self._entries])

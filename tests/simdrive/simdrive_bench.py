@@ -7,6 +7,7 @@ from pathlib import Path
 from canopen import SdoAbortedError
 
 from canwall.simdrive import Dictionary, Frame, SimulatedDrive
+from canwall.simdrive.memory import Memory
 
 EDS = Path(__file__).parents[2] / "eds" / "canwall-drive.eds"
 NODE_ID = 5
@@ -55,10 +56,10 @@ class RecordingMotion:
 class Bench:
     """One booted drive, and what a master does to it."""
 
-    def __init__(self, eds: Path = EDS, store: Path | None = None) -> None:
+    def __init__(self, eds: Path = EDS, store: Path | None = None, node_id: int = NODE_ID) -> None:
         self.motion = RecordingMotion()
-        dictionary = Dictionary.load(eds, NODE_ID)
-        self.drive = SimulatedDrive(dictionary, NODE_ID, self.motion, PERIOD_S, store)
+        dictionary = Dictionary.load(eds, node_id)
+        self.drive = SimulatedDrive(dictionary, node_id, self.motion, PERIOD_S, Memory(store))
         self.sent = self.drive.boot()
         """Every frame that the drive has sent."""
 

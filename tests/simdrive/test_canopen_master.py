@@ -108,14 +108,44 @@ def test_lss(node: BaseNode402) -> None:
     assert lss.inquire_node_id() == NODE_ID
     lss.configure_node_id(9)
     lss.store_configuration()
+    lss.configure_bit_timing(0)
     with pytest.raises(LssError, match="LSS Error: 1"):
-        lss.configure_bit_timing(0)
+        lss.configure_bit_timing(2)
+    lss.activate_bit_timing(1)
     lss.send_switch_state_global(lss.WAITING_STATE)
     other = node.network.add_node(BaseNode402(9, str(EDS)))
     node.nmt.send_command(130)
     wait_for(lambda: bool(other.nmt.state == "PRE-OPERATIONAL"))
     other.sdo.RESPONSE_TIMEOUT = WAIT_S
     assert other.sdo[0x1200][1].raw == 0x609
+
+
+def test_lss_finds_who_has_no_node_id(node: BaseNode402) -> None:
+    """canopen takes no answer to a scanned bit for a 1, so its patience is how long a 1 takes."""
+    lss = node.network.lss
+    lss.send_switch_state_global(lss.CONFIGURATION_STATE)
+    lss.configure_node_id(255)
+    lss.send_switch_state_global(lss.WAITING_STATE)
+    node.nmt.send_command(129)
+    found: list[bytes] = []
+    node.network.subscribe(0x7E4, lambda _, data, __: found.append(bytes(data)))
+    lss.send_identify_non_configured_remote_slave()
+    wait_for(partial(has_length, found, 1))
+    assert found[0][0] == 0x50
+    assert lss.fast_scan() == (True, [0, 1, 0x00010000, 1])
+    assert lss.inquire_node_id() == 255
+    lss.configure_node_id(NODE_ID)
+    assert node.nmt.state == "INITIALISING"
+    lss.send_switch_state_global(lss.WAITING_STATE)
+    wait_for(lambda: bool(node.nmt.state == "PRE-OPERATIONAL"))
+    assert node.sdo[0x1200][1].raw == 0x605
+
+
+def test_lss_identifies(node: BaseNode402) -> None:
+    lss = node.network.lss
+    lss.send_identify_remote_slave(0, 1, 0, 0xFFFFFFFF, 0, 0xFFFFFFFF)
+    answer = lss.responses.get(timeout=WAIT_S)
+    assert answer[0] == 0x4F
 
 
 def test_emcy(node: BaseNode402) -> None:

@@ -13,6 +13,7 @@ from simdrive_bench import (
     PRE_OPERATIONAL,
     RESET_COMMUNICATION,
     START,
+    STATUSWORD,
     STOP,
     SYNC,
     TPDO,
@@ -104,6 +105,45 @@ def test_tpdo_that_is_asked_for(bench: Bench, kind: int) -> None:
     assert position in bench.request(TPDO[4])
     bench.nmt(STOP)
     assert bench.request(TPDO[4]) == []
+
+
+def position_now(bench: Bench) -> tuple[int, bytes]:
+    return TPDO[4], bench.motion.position.to_bytes(4, "little")
+
+
+@pytest.fixture
+def quiet(bench: Bench) -> Bench:
+    """No TPDO but the fourth is there."""
+    for index, can_id in ((0x1800, 0x185), (0x1801, 0x285), (0x1802, 0x385)):
+        bench.write(index, 1, NOT_VALID | can_id, 4)
+    return bench
+
+
+@pytest.mark.parametrize("kind", [252, 253])
+def test_tpdo_for_remote_frames_alone(quiet: Bench, kind: int) -> None:
+    quiet.configure_pdo(0x1803, TPDO[4], kind, [POSITION], event_ms=1)
+    assert quiet.read(0x1803, 2) == kind
+    assert quiet.nmt(START) == []
+    assert quiet.request(TPDO[4]) == [position_now(quiet)]
+    for _ in range(3):
+        assert quiet.sync() == []
+        assert quiet.tick(1.0) == []
+    assert len(quiet.request(TPDO[4])) == 1
+
+
+def test_remote_frame_gets_the_last_sample(quiet: Bench) -> None:
+    """252: what the last SYNC has sampled; 253: what is there now."""
+    sampled, present = [STATUSWORD], [STATUSWORD]
+    quiet.tick()
+    quiet.configure_pdo(0x1802, TPDO[3], 252, sampled)
+    quiet.configure_pdo(0x1803, TPDO[4], 253, present)
+    quiet.nmt(START)
+    quiet.sync()
+    quiet.write(0x6040, 0, 0x06, 2)
+    assert quiet.request(TPDO[3]) == [(TPDO[3], b"\x50\x02")]
+    assert quiet.request(TPDO[4]) == [(TPDO[4], b"\x31\x02")]
+    quiet.sync()
+    assert quiet.request(TPDO[3]) == [(TPDO[3], b"\x31\x02")]
 
 
 def test_tpdo_that_does_not_answer(bench: Bench) -> None:

@@ -1,10 +1,21 @@
 """Store and restore parameters (0x1010, 0x1011), across resets and restarts."""
 
+import struct
 from pathlib import Path
 
 import pytest
 from canopen import SdoAbortedError
-from simdrive_bench import EDS, RESET_COMMUNICATION, RESET_NODE, START, Bench, eds_with
+from simdrive_bench import (
+    CONTROLWORD,
+    EDS,
+    NO_RTR,
+    NOT_VALID,
+    RESET_COMMUNICATION,
+    RESET_NODE,
+    START,
+    Bench,
+    eds_with,
+)
 
 from canwall import config
 from canwall.eds import DictionaryError
@@ -111,13 +122,38 @@ def test_pdos_are_stored(file: Path) -> None:
     assert after.cycle()[0] == 0x0231
 
 
+def stored(**changes: str) -> str:
+    """Return the text of a file, some of it changed."""
+    content = {
+        "identity": "[0, 1, 65536]",
+        "node_id": "null",
+        "stored_by_node": "5",
+        "objects": "{}",
+    } | changes
+    return "{" + ", ".join(f'"{key}": {value}' for key, value in content.items()) + "}"
+
+
+def test_file_without_changes_is_one(file: Path) -> None:
+    file.write_text(stored())
+    assert values(Bench(store=file)) == (0, 3000)
+
+
 @pytest.mark.parametrize(
     "text",
-    ["", "{}", '{"node_id": null, "identity": [0, 1, 65536], "objects": {"1017:00": "00"}}',
-     '{"node_id": null, "identity": [0, 1, 65536], "objects": {"2999:00": "00"}}',
-     '{"node_id": null, "identity": [0, 1, 65536], "objects": {"6041:00": "0000"}}',
-     '{"node_id": null, "identity": [1, 1, 65536], "objects": {}}'],
-)  # fmt: skip
+    [
+        "",
+        "{}",
+        stored(objects='{"1017:00": "00"}'),
+        stored(objects='{"2999:00": "00"}'),
+        stored(objects='{"6041:00": "0000"}'),
+        stored(objects='{"1017": "0000"}'),
+        stored(objects='{"1017:00": "xx"}'),
+        stored(identity="[1, 1, 65536]"),
+        stored(node_id="128"),
+        stored(node_id='"5"'),
+        stored(stored_by_node="255"),
+    ],
+)
 def test_file_of_something_else(file: Path, text: str) -> None:
     file.write_text(text)
     with pytest.raises(DictionaryError, match=f"^{file}: .*; remove it"):
@@ -136,6 +172,41 @@ def test_manufacturer_parameters(tmp_path: Path, file: Path) -> None:
     assert bench.read(0x1010, 4) == 1
     after = Bench(more, file)
     assert (after.read(0x2000), *values(after)) == (9, 0, 3000)
+
+
+@pytest.mark.parametrize("in_a_file", [True, False])
+def test_stored_cob_ids_and_another_node_id(file: Path, in_a_file: bool) -> None:
+    """The predefined identifiers are those of the node; the others those of whoever chose them."""
+    bench = Bench(store=file if in_a_file else None)
+    bench.configure_pdo(0x1402, 0x185, 1, [CONTROLWORD])  # what another node sends
+    bench.write(0x1800, 1, NOT_VALID | NO_RTR | 0x185, 4)
+    bench.write(0x1801, 1, NOT_VALID | 0x1E5, 4)
+    bench.write(0x1014, 0, NOT_VALID | 0x85, 4)
+    bench.write(0x6072, 0, 1500, 2)
+    bench.write(0x1010, ALL, SAVE, 4)
+    for request in (b"\x04\x01", b"\x11\x09", b"\x17"):
+        bench.give(0x7E5, request.ljust(8, b"\0"))
+    bench.nmt(RESET_NODE)
+    assert bench.sent[-1] == (0x709, b"\0")
+    if in_a_file:
+        bench = Bench(store=file, node_id=9)
+
+    def read(index: int, subindex: int) -> int:
+        request = struct.pack("<BHB4x", 0x40, index, subindex)
+        ((can_id, answer),) = bench.give(0x609, request)
+        assert (can_id, answer[0]) == (0x589, 0x43)
+        return int.from_bytes(answer[4:], "little")
+
+    assert read(0x1800, 1) == NOT_VALID | NO_RTR | 0x189
+    assert read(0x1801, 1) == NOT_VALID | 0x1E5
+    assert read(0x1402, 1) == 0x185
+    assert read(0x1403, 1) == NOT_VALID | 0x509
+    assert read(0x1014, 0) == NOT_VALID | 0x89
+    assert read(0x1200, 1) == 0x609
+    back = Bench(store=file if in_a_file else None)
+    if in_a_file:
+        assert back.read(0x1800, 1) == NOT_VALID | NO_RTR | 0x185
+        assert back.read(0x6072) == 1500
 
 
 def test_path_is_relative_to_the_configuration(tmp_path: Path) -> None:
