@@ -81,9 +81,17 @@ def run(
 
 
 @app.command()
-def drive(config_file: _ConfigArgument = None) -> int:
+def drive(
+    config_file: _ConfigArgument = None,
+    real_time: Annotated[
+        bool, typer.Option("--real-time", help="Time as measured, not a period per SYNC.")
+    ] = False,
+) -> int:
     """A simulated drive, alone on the bus of CONFIG, until stopped."""
     settings = _settings(config_file)
+    if real_time and settings.simulation is not None:
+        simulation = settings.simulation.model_copy(update={"real_time": True})
+        settings = settings.model_copy(update={"simulation": simulation})
     if settings.bus.interface == "virtual":
         raise ConfigError(
             "bus.interface = 'virtual' ends at this process, so nobody could reach the drive; "

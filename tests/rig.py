@@ -54,6 +54,10 @@ class Tampering:
     deaf: set[int] = field(default_factory=set)
     mute: set[int] = field(default_factory=set)
 
+    @property
+    def real_time(self) -> bool:
+        return self.drive.real_time
+
     def boot(self) -> list[simdrive.Frame]:
         return self._out(self.drive.boot())
 

@@ -168,7 +168,7 @@ class Settings(Section):
     def real_time(self) -> bool:
         """Whether SYNCs keep to the wall clock, or go out as fast as the simulation answers."""
         if self.bus.pace == "auto":
-            return self.simulation is None
+            return self.simulation is None or self.simulation.real_time
         return self.bus.pace == "real_time"
 
     def to_toml(self) -> str:

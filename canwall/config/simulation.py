@@ -41,6 +41,9 @@ class Simulation(Section):
 
     Rated torque and encoder are those of the dictionary (0x6076, 0x608F) where it has them. What
     is stored over 0x1010 outlives the drive in the file `store`, if there is one.
+
+    Time is one `[bus] cycle_s` per SYNC or, with `real_time`, what is measured. The torque of an
+    RPDO acts `torque_delay_cycles` periods after the SYNC (synchronous) or the arrival (254, 255).
     """
 
     rated_torque_nm: Annotated[Positive, Field(ge=0.001)] = 0.637
@@ -49,6 +52,8 @@ class Simulation(Section):
     viscous_nm_s_per_rad: NonNegative = 5.0e-4
     coulomb_nm: NonNegative = 0.01
     store: Path | None = None
+    real_time: bool = False
+    torque_delay_cycles: Annotated[NonNegative, Field(le=1000.0)] = 0.0
     hand: Hand = Hand()
 
     @field_validator("store", mode="before")

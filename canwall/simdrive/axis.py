@@ -111,11 +111,22 @@ class Axis:
         elif option == _QUICK_STOP:
             self.state_machine.command(Command.QUICK_STOP)
 
-    def apply_torque(self, duration_s: float) -> float:
-        """Let the target torque take effect; return the torque that applies from now, in N m.
+    @property
+    def torque_nm(self) -> float:
+        """Torque demanded of the motor, in N m."""
+        torque_nm: float = self._torque_demand.value * self._rated_torque.value / _PER_MILLE_MILLI
+        return torque_nm
+
+    def show_torque(self, torque_nm: float) -> None:
+        """Let 0x6077 show a torque that is not the one demanded (0x6074)."""
+        rated = self._rated_torque.value
+        self._actual_torque.value = round(torque_nm * _PER_MILLE_MILLI / rated) if rated else 0
+
+    def apply_torque(self, duration_s: float) -> None:
+        """Let the target torque take effect: it is demanded from now on.
 
         Args:
-            duration_s: time for which it will apply, in seconds: a slope goes on by as much.
+            duration_s: time that a slope goes on by, in seconds.
         """
         actual = 0
         limited = reached = False
@@ -133,8 +144,6 @@ class Axis:
             self._limited = limited
             self._reached = reached
             self._show_status()
-        torque_nm: float = actual * self._rated_torque.value / _PER_MILLE_MILLI
-        return torque_nm
 
     def _next_of_ramp(self, duration_s: float) -> tuple[bool, int]:
         """Return whether the torque has come where it was to go, and the torque."""

@@ -29,7 +29,16 @@ def make_drive(
         dictionary.supply(*unit, 1)
     counts = _quotient(dictionary, 0x608F) * _quotient(dictionary, 0x6091)
     motion = ServoMotion(simulation, sync_period_s, counts)
-    return SimulatedDrive(dictionary, node_id, motion, sync_period_s, memory, bitrate)
+    return SimulatedDrive(
+        dictionary,
+        node_id,
+        motion,
+        sync_period_s,
+        memory,
+        bitrate,
+        simulation.torque_delay_cycles,
+        simulation.real_time,
+    )
 
 
 def _quotient(dictionary: Dictionary, index: int) -> float:

@@ -5,6 +5,7 @@ from functools import partial
 from typing import TypeAlias
 
 from canwall.simdrive import lss, nmt, rpdo, tpdo
+from canwall.simdrive.actuator import Actuator
 from canwall.simdrive.axis import Axis, Motion
 from canwall.simdrive.dictionary import Dictionary, Key
 from canwall.simdrive.emcy import COMMUNICATION, HEARTBEAT_LOST, EmergencyProducer
@@ -33,7 +34,11 @@ _ABORT_CONNECTION = (0x6007, 0)
 class SimulatedDrive:
     """A CiA 402 servo drive in its torque modes: frames in, frames out.
 
-    No threads and no clock: SYNC moves the physics, ``tick`` the protocol timers.
+    No threads and no clock: SYNC moves the physics by one period, ``tick`` the protocol timers.
+    In real time ``tick`` moves the physics too, and SYNC does not.
+
+    The physics are lazy. What holds between two instants is known at the second: only then is the
+    motion moved on, under the torque that held, before anything is sampled or changed.
     """
 
     def __init__(
@@ -44,6 +49,8 @@ class SimulatedDrive:
         sync_period_s: float,
         memory: Memory | None = None,
         bitrate: int = DEFAULT_BITRATE,
+        torque_delay_cycles: float = 0.0,
+        real_time: bool = False,
     ) -> None:
         """Build the drive; it is dead until ``boot``.
 
@@ -51,22 +58,34 @@ class SimulatedDrive:
             dictionary: object dictionary, loaded for this node-ID; the drive takes it over.
             node_id: 1 to 127, or UNCONFIGURED: then LSS alone has to give it one.
             motion: motor, encoder and hand.
-            sync_period_s: time in seconds by which each SYNC moves the physics.
+            sync_period_s: time in seconds from one SYNC to the next.
             memory: what keeps stored parameters (0x1010) and the node-ID of LSS.
             bitrate: of the bus, in bit/s.
+            torque_delay_cycles: from the torque that a PDO brings to its effect, in SYNC periods,
+                beyond what the transmission type of the PDO makes of it.
+            real_time: the physics move by the time that ``tick`` tells.
 
         Raises:
             DictionaryError: the dictionary has what no drive can be built from.
-            ValueError: the node-ID is not that of the dictionary, or the period not positive.
+            ValueError: the node-ID is not that of the dictionary, the period not positive, or the
+                delay negative.
         """
         if node_id not in (dictionary.node_id, UNCONFIGURED):
             raise ValueError(f"node-ID {node_id}, but {dictionary.node_id} in the dictionary")
         if not sync_period_s > 0:
             raise ValueError(f"SYNC period {sync_period_s} s is not positive")
+        if not torque_delay_cycles >= 0.0:
+            raise ValueError(f"torque delay of {torque_delay_cycles} cycles is negative")
         self._motion = motion
+        self._actuator = Actuator(motion, sync_period_s, torque_delay_cycles)
         self._sync_period_s = sync_period_s
         self._memory = memory or Memory(None)
         self._bitrate = bitrate
+        self.real_time = real_time
+        """Whether the physics move by the time that ``tick`` tells, not by the count of SYNCs."""
+        self._sync_is_time = False
+        self._passed_s = 0.0
+        """Time that the slope of the torque (0x6087) has not been told of."""
         self._build(dictionary, node_id)
 
     def _build(self, dictionary: Dictionary, node_id: int) -> None:
@@ -150,6 +169,9 @@ class SimulatedDrive:
     def tick(self, dt: float) -> list[Frame]:
         """Let the protocol timers go on by ``dt`` seconds; return the frames that are due."""
         self._clock.advance(dt)
+        if self.real_time:
+            self._pass(dt / self._sync_period_s)
+            self._apply_torque()
         if self._nmt.state is not NmtState.INITIALISATION:
             self._axis.state_machine.step()
             self._heartbeat_producer.tick(self._nmt.state)
@@ -164,6 +186,8 @@ class SimulatedDrive:
         return self._take_outbox()
 
     def _take_outbox(self) -> list[Frame]:
+        if not self._outbox:
+            return []
         frames = self._outbox.copy()
         self._outbox.clear()
         return frames if self._clock.now_ns >= self._silent_until_ns else []
@@ -183,10 +207,10 @@ class SimulatedDrive:
         routes: dict[int, Receive] = {}
         remote_routes: dict[int, Callable[[], None]] = {}
         if state is not NmtState.INITIALISATION:
-            routes |= _receivers(rpdos)
+            routes |= _receivers([(pdo, self._receive_of(pdo)) for pdo in rpdos])
             routes |= self._heartbeat_consumer.routes()
             if state is not NmtState.STOPPED:
-                routes[self._sdo.can_id] = self._sdo.receive
+                routes[self._sdo.can_id] = self._at_once(self._sdo.receive)
             # The world does not stand still where NMT wants no SYNC.
             routes[self._sync.can_id] = self._on_sync
             routes[nmt.CAN_ID] = self._nmt.receive
@@ -198,17 +222,49 @@ class SimulatedDrive:
         self._routes = routes
         self._remote_routes = remote_routes
 
+    def _receive_of(self, received: Rpdo) -> Receive:
+        return received.receive if received.synchronous else self._at_once(received.receive)
+
+    def _at_once(self, receive: Receive) -> Receive:
+        """Let a torque that a frame brings hold from its arrival on, not from the next SYNC."""
+
+        def received(data: bytes) -> None:
+            receive(data)
+            self._apply_torque()
+
+        return received
+
+    def _pass(self, periods: float) -> None:
+        """Let time pass for the physics, under the torque that has held until now."""
+        actuator = self._actuator
+        if actuator.delayed and not self._axis.state_machine.powered:
+            actuator.cut()
+        actuator.advance(self._axis.torque_nm, periods)
+        self._passed_s += periods * self._sync_period_s
+
+    def _apply_torque(self) -> None:
+        """Let the target torque hold from now on."""
+        self._axis.apply_torque(self._passed_s)
+        self._passed_s = 0.0
+        if not self._actuator.direct:
+            self._axis.show_torque(self._actuator.torque_nm(self._axis.torque_nm))
+
     def _on_sync(self, data: bytes) -> None:
+        if self._sync_is_time:
+            self._pass(1.0)
+        elif not self.real_time:
+            # Before the first SYNC there is no period, but the first step of a slope is due.
+            self._sync_is_time = True
+            self._passed_s = self._sync_period_s
         if not self._sync.receive(data):
             return
         self._axis.state_machine.step()
         for received in self._sync_rpdos:
             received.sync()
-        torque_nm = self._axis.apply_torque(self._sync_period_s)
+        self._apply_torque()
         self._axis.sample()
         for transmitted in self._sync_tpdos:
             transmitted.sync(self._sync.counter)
-        self._motion.advance(torque_nm, self._sync_period_s)
 
     def _leaving(self) -> None:
         if self._nmt.state is NmtState.OPERATIONAL:
@@ -264,11 +320,11 @@ class SimulatedDrive:
         self._emcy.gone(HEARTBEAT_LOST, source)
 
 
-def _receivers(rpdos: list[Rpdo]) -> dict[int, Receive]:
+def _receivers(rpdos: list[tuple[Rpdo, Receive]]) -> dict[int, Receive]:
     """Return who takes each CAN-ID; several RPDOs may listen to one."""
     listeners: dict[int, list[Receive]] = {}
-    for pdo in rpdos:
-        listeners.setdefault(pdo.can_id, []).append(pdo.receive)
+    for pdo, receive in rpdos:
+        listeners.setdefault(pdo.can_id, []).append(receive)
     return {
         can_id: receivers[0] if len(receivers) == 1 else partial(_call_each, receivers)
         for can_id, receivers in listeners.items()

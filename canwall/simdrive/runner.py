@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import can
 
@@ -12,21 +13,48 @@ _TICK_S = 0.001
 """Least time between ticks, and longest wait for a frame."""
 
 
+class _DataFrame(can.Message):
+    """A frame of the drive.
+
+    python-can's virtual bus copies each frame deeply for everyone on it, which by the general way
+    of copy.deepcopy takes several times as long as what the drive does in a cycle.
+    """
+
+    def __init__(self, can_id: int, data: bytes) -> None:
+        super().__init__(arbitration_id=can_id, is_extended_id=False, data=data)
+
+    def __deepcopy__(self, memo: dict[int, Any] | None) -> can.Message:
+        copy = _DataFrame(self.arbitration_id, bytes(self.data))
+        copy.timestamp = self.timestamp
+        return copy
+
+
 class BusRunner:
     """Carries frames between a bus and a drive, in their order, and measures time for it.
 
     Use ``poll`` within another program's loop, or ``run`` to have the thread to oneself.
     """
 
-    def __init__(self, drive: SimulatedDrive, bus: can.BusABC) -> None:
+    def __init__(
+        self,
+        drive: SimulatedDrive,
+        bus: can.BusABC,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         """Switch the drive on: its boot-up message goes onto the bus.
+
+        Args:
+            drive: not yet switched on.
+            bus: where it lives; stays the caller's to shut down.
+            clock: tells the time in seconds.
 
         Raises:
             can.CanError: the bus does not take the message.
         """
         self._drive = drive
         self._bus = bus
-        self._last_tick_s = time.monotonic()
+        self._clock = clock
+        self._last_tick_s = clock()
         self._send(drive.boot())
 
     def poll(self) -> None:
@@ -37,7 +65,7 @@ class BusRunner:
         """
         while (message := self._bus.recv(0)) is not None:
             self._handle(message)
-        self._tick()
+        self._tick(_TICK_S)
 
     def run(self, stop: Callable[[], bool]) -> None:
         """Serve the bus until ``stop`` says so; it is asked every millisecond or more often.
@@ -49,22 +77,25 @@ class BusRunner:
             message = self._bus.recv(_TICK_S)
             if message is not None:
                 self._handle(message)
-            self._tick()
+            self._tick(_TICK_S)
 
     def _handle(self, message: can.Message) -> None:
         if message.is_error_frame or message.is_extended_id:
             return
+        if self._drive.real_time:
+            # What a frame changes holds from its arrival on.
+            self._tick(0.0)
         if message.is_remote_frame:
             self._send(self._drive.request(message.arbitration_id))
-            return
-        self._send(self._drive.process(message.arbitration_id, bytes(message.data)))
+        else:
+            self._send(self._drive.process(message.arbitration_id, bytes(message.data)))
 
-    def _tick(self) -> None:
-        now_s = time.monotonic()
-        if now_s - self._last_tick_s >= _TICK_S:
+    def _tick(self, least_s: float) -> None:
+        now_s = self._clock()
+        if now_s - self._last_tick_s >= least_s:
             self._send(self._drive.tick(now_s - self._last_tick_s))
             self._last_tick_s = now_s
 
     def _send(self, frames: Iterable[Frame]) -> None:
         for can_id, data in frames:
-            self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+            self._bus.send(_DataFrame(can_id, data))

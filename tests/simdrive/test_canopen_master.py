@@ -194,7 +194,7 @@ def test_enable_and_torque(node: BaseNode402, motion: RecordingMotion) -> None:
 
     assert received == [(0x1237, 1000, 100), (0x1237, 1007, -200), (0x1A37, 1014, 3000)]
     advanced = [call[1] for call in motion.calls if call[0] == "advance"]
-    assert advanced == pytest.approx([0.0637, -0.1274, 1.911])
+    assert advanced == pytest.approx([0.0637, -0.1274])
     node.state = "SWITCH ON DISABLED"
     assert node.sdo["Torque actual value"].raw == 0
 

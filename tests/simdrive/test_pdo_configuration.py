@@ -47,7 +47,7 @@ def test_order_of_cia_301(bench: Bench, number: int) -> None:
     ]
     bench.nmt(START)
     ((_, data),) = [frame for frame in bench.sync() if frame[0] == TPDO[number]]
-    assert data == struct.pack("<hiH", 0, bench.motion.position - bench.motion.step, 0x0250)
+    assert data == struct.pack("<hiH", 0, bench.motion.position, 0x0250)
 
 
 def test_only_the_mapped_number_of_entries_is_sent(bench: Bench) -> None:

@@ -77,8 +77,9 @@ def test_inhibit_time_keeps_events_apart(quiet: Bench) -> None:
     first = quiet.motion.position
     assert quiet.sent[-1] == (TPDO[4], struct.pack("<i", first))
     quiet.sync()
-    last = quiet.motion.position
     assert quiet.sync() == []
+    last = quiet.motion.position
+    assert last != first
     assert quiet.tick(2.4 * MS) == []
     assert quiet.tick(0.1 * MS) == [(TPDO[4], struct.pack("<i", last))]
     assert quiet.tick(1.0) == []

@@ -39,23 +39,33 @@ def test_torque_takes_effect_with_the_next_sync(cyclic: Bench) -> None:
     assert cyclic.motion.calls == []
     start = cyclic.motion.position
 
-    assert cyclic.cycle() == (ENABLED, start, 500)
     assert cyclic.cycle() == (ENABLED, start + 7, 500)
+    assert cyclic.cycle() == (ENABLED, start + 14, 500)
     cyclic.command(0x0F, -250)
-    assert cyclic.cycle() == (ENABLED, start + 14, -250)
+    assert cyclic.cycle() == (ENABLED, start + 21, -250)
+    cyclic.cycle()
 
     torques = [call[1] for call in cyclic.motion.calls if call[0] == "advance"]
-    assert torques == pytest.approx([0.5 * RATED_NM, 0.5 * RATED_NM, -0.25 * RATED_NM])
+    assert torques == pytest.approx([0.0, 0.5 * RATED_NM, 0.5 * RATED_NM, -0.25 * RATED_NM])
 
 
-def test_position_is_sampled_before_the_physics_go_on(cyclic: Bench) -> None:
+def test_a_period_passes_before_its_end_is_sampled(cyclic: Bench) -> None:
     cyclic.command(0x0F, 1000)
     position = cyclic.motion.position
     cyclic.cycle()
+    cyclic.cycle()
     assert cyclic.motion.calls == [
-        ("counts", position),
+        ("advance", 0.0, PERIOD_S),
+        ("counts", position + 7),
         ("advance", pytest.approx(RATED_NM), PERIOD_S),
+        ("counts", position + 14),
     ]
+
+
+def test_no_period_has_passed_at_the_first_sync(bench: Bench) -> None:
+    bench.motion.calls.clear()
+    bench.sync()
+    assert bench.motion.calls == [("counts", bench.motion.position)]
 
 
 def test_controlword_takes_effect_with_the_same_sync(cyclic: Bench) -> None:
@@ -113,9 +123,14 @@ def test_limits(cyclic: Bench, limits: dict[int, int], target: int, actual: int)
     status, _, torque = cyclic.cycle()
     assert torque == actual
     assert status == (ENABLED if actual == target else ENABLED | LIMITED)
-    assert cyclic.motion.calls[-1][1] == pytest.approx(actual * RATED_NM / 1000)
+    cyclic.motion.calls.clear()
     cyclic.command(0x0F, 0)
     assert cyclic.cycle()[0] == ENABLED
+    assert cyclic.motion.calls[0] == (
+        "advance",
+        pytest.approx(actual * RATED_NM / 1000),
+        PERIOD_S,
+    )
 
 
 def test_no_torque_without_mode_or_in_halt(cyclic: Bench) -> None:
@@ -134,8 +149,9 @@ def test_torque_is_gone_at_once_when_disabled_between_syncs(cyclic: Bench) -> No
     cyclic.write(0x6040, 0, 0, 2)
     assert cyclic.read(0x6077) == 0
     assert cyclic.read(0x6041) == 0x0250
+    cyclic.motion.calls.clear()
     cyclic.sync()
-    assert cyclic.motion.calls[-1] == ("advance", 0.0, PERIOD_S)
+    assert cyclic.motion.calls[0] == ("advance", 0.0, PERIOD_S)
 
 
 @pytest.mark.parametrize("command", [PRE_OPERATIONAL, STOP])
@@ -147,7 +163,7 @@ def test_sync_moves_the_physics_without_pdos_outside_operational(
     cyclic.nmt(command)
     cyclic.motion.calls.clear()
     assert cyclic.sync() == []
-    assert cyclic.motion.calls[-1] == ("advance", 0.0, PERIOD_S)
+    assert cyclic.motion.calls[0] == ("advance", 0.0, PERIOD_S)
 
 
 def test_torque_goes_on_outside_operational_if_0x6007_says_so(cyclic: Bench) -> None:
@@ -156,8 +172,9 @@ def test_torque_goes_on_outside_operational_if_0x6007_says_so(cyclic: Bench) -> 
     cyclic.cycle()
     cyclic.nmt(PRE_OPERATIONAL)
     cyclic.command(0x0F, 900)  # no RPDO in PRE-OPERATIONAL
+    cyclic.motion.calls.clear()
     assert cyclic.sync() == []
-    assert cyclic.motion.calls[-1] == ("advance", pytest.approx(0.5 * RATED_NM), PERIOD_S)
+    assert cyclic.motion.calls[0] == ("advance", pytest.approx(0.5 * RATED_NM), PERIOD_S)
 
 
 def test_what_was_received_before_is_not_for_a_later_operational(cyclic: Bench) -> None:
@@ -168,12 +185,15 @@ def test_what_was_received_before_is_not_for_a_later_operational(cyclic: Bench) 
     assert cyclic.cycle()[2] == 0
 
 
-def test_immediate_rpdo_acts_on_reception_and_its_torque_with_the_sync(cyclic: Bench) -> None:
-    cyclic.configure_pdo(0x1402, RPDO[3], 255, [CONTROLWORD, TARGET_TORQUE])
+@pytest.mark.parametrize("kind", [254, 255])
+def test_asynchronous_rpdo_acts_on_reception(cyclic: Bench, kind: int) -> None:
+    cyclic.configure_pdo(0x1402, RPDO[3], kind, [CONTROLWORD, TARGET_TORQUE])
+    cyclic.motion.calls.clear()
     cyclic.command(0x0F, 700)
     assert cyclic.read(0x6071) == 700
-    assert cyclic.read(0x6077) == 0
+    assert cyclic.read(0x6077) == 700
     assert cyclic.cycle()[2] == 700
+    assert cyclic.motion.calls[0] == ("advance", pytest.approx(0.7 * RATED_NM), PERIOD_S)
     cyclic.command(0x07, 700)
     assert cyclic.read(0x6041) == 0x0233
 
@@ -196,8 +216,8 @@ def test_sync_under_another_identifier(cyclic: Bench) -> None:
 def test_position_wraps_to_32_bits_and_velocity_saturates(cyclic: Bench) -> None:
     cyclic.motion.position = 2**31 + 5
     cyclic.motion.speed = -1e12
-    assert cyclic.cycle()[1] == -(2**31) + 5
-    assert cyclic.read(0x6064, signed=True) == -(2**31) + 5
+    assert cyclic.cycle()[1] == -(2**31) + 12
+    assert cyclic.read(0x6064, signed=True) == -(2**31) + 12
     assert cyclic.read(0x606C, signed=True) == -(2**31)
     cyclic.motion.speed = -12.6
     cyclic.sync()
@@ -207,7 +227,7 @@ def test_position_wraps_to_32_bits_and_velocity_saturates(cyclic: Bench) -> None
 def test_sdo_shows_the_last_sample(cyclic: Bench) -> None:
     _, position, _ = cyclic.cycle()
     assert cyclic.read(0x6064) == position
-    assert cyclic.motion.position == position + cyclic.motion.step
+    assert cyclic.motion.position == position
 
 
 def test_position_is_there_before_the_first_sync(bench: Bench) -> None:

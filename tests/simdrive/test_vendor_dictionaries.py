@@ -160,6 +160,7 @@ def test_units(vendor: Vendor, of_vendor: VendorBench, monkeypatch: pytest.Monke
     bench.enable()
     bench.write(0x6071, 0, 100, 2)
     bench.sync()
+    bench.sync()
     assert torques[-1] == pytest.approx(0.1 * vendor.rated_torque_mnm / 1000)
     turn = SIMULATION.hand.rest_rad / 6.283185307179586
     assert bench.read(0x6064) == pytest.approx(turn * vendor.counts_per_rev, abs=0.51)
