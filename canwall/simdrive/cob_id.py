@@ -20,13 +20,14 @@ _RESTRICTED = (
 
 
 def check_can_id(cob_id: int) -> None:
-    """Refuse 29-bit and restricted identifiers.
+    """Refuse 29-bit and restricted identifiers; those of a COB-ID that is not valid: 29-bit ones.
 
     Raises:
         AccessError: INVALID_VALUE.
     """
     can_id = cob_id & CAN_ID
-    if cob_id & EXTENDED or any(can_id in ids for ids in _RESTRICTED):
+    restricted = not cob_id & NOT_VALID and any(can_id in ids for ids in _RESTRICTED)
+    if cob_id & EXTENDED or restricted:
         raise AccessError(AbortCode.INVALID_VALUE)
 
 

@@ -115,8 +115,7 @@ class EmergencyProducer:
             entry.value = None
 
     def _check_cob_id(self, value: int) -> None:
+        check_can_id(value)
+        if value & BIT_30:
+            raise AccessError(AbortCode.INVALID_VALUE)
         check_unchanged_while_valid(self._cob_id.value, value)
-        if not value & NOT_VALID:
-            check_can_id(value)
-            if value & BIT_30:
-                raise AccessError(AbortCode.INVALID_VALUE)

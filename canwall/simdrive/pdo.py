@@ -136,9 +136,9 @@ class Pdo:
         return form, entry
 
     def _check_cob_id(self, value: int) -> None:
+        check_can_id(value)
         check_unchanged_while_valid(self._cob_id.value, value)
         if not value & NOT_VALID:
-            check_can_id(value)
             if not self._count.value:
                 raise AccessError(AbortCode.DEVICE_STATE)
             self._compile(self._count.value)

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from canwall.simdrive.abort import AbortCode, AccessError
-from canwall.simdrive.cob_id import BIT_30, CAN_ID, check_can_id
+from canwall.simdrive.cob_id import BIT_30, CAN_ID, NOT_VALID, check_can_id
 from canwall.simdrive.dictionary import Dictionary, Key
 from canwall.simdrive.emcy import SYNC_LENGTH, SYNC_LOST, EmergencyProducer
 from canwall.simdrive.frame import NS_PER_US, Clock
@@ -107,7 +107,7 @@ class SyncConsumer:
             self._lost(SYNC_LOST, _CYCLE_PERIOD)
 
     def _check_cob_id(self, value: int) -> None:
-        check_can_id(value)
+        check_can_id(value & ~NOT_VALID)  # bit 31 means nothing here
         if value & BIT_30:
             raise AccessError(AbortCode.INVALID_VALUE)
 

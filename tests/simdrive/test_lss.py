@@ -141,6 +141,7 @@ def test_node_without_an_id_starts_when_it_is_given_one(unconfigured: Bench) -> 
     assert ask(unconfigured, 0x11, 9) == [frame(0x11)]
     assert ask(unconfigured, 0x5E) == [frame(0x5E, 9)]
     assert ask(unconfigured, 0x4C) == []
+    assert ask(unconfigured, 0x04, CONFIGURATION) == []
     assert unconfigured.give(REQUEST, frame(0x04, WAITING)) == [(0x709, b"\0")]
     assert len(unconfigured.give(0x609, bytes.fromhex("40 0010 00 00000000"))) == 1
 

@@ -84,6 +84,8 @@ REFUSED: dict[str, tuple[str, Callable[[Bench], None]]] = {
     "inhibit time of a valid PDO": (DEVICE_STATE, write(0x1800, 3, 10, 2)),
     "valid with nothing mapped": (DEVICE_STATE, invalid_pdo(write(0x1400, 1, RPDO[1], 4))),
     "29-bit identifier": (INVALID_VALUE, write(0x1403, 1, 0x20000505, 4)),
+    "29-bit identifier, not valid": (INVALID_VALUE, write(0x1403, 1, 0xA0000505, 4)),
+    "reserved bits": (INVALID_VALUE, write(0x1803, 1, 0x80001505, 4)),
     "identifier of the SDO": (INVALID_VALUE, write(0x1403, 1, 0x605, 4)),
     "identifier of NMT": (INVALID_VALUE, write(0x1403, 1, 0x000, 4)),
     "transmission type 241": (INVALID_VALUE, write(0x1800, 2, 241, 1)),

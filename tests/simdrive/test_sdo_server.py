@@ -8,10 +8,19 @@ import pytest
 from canopen import SdoAbortedError
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from simdrive_bench import PRE_OPERATIONAL, RESET_COMMUNICATION, SDO_REQUEST, STOP, Bench, eds_with
+from simdrive_bench import (
+    PRE_OPERATIONAL,
+    RESET_COMMUNICATION,
+    SDO_REQUEST,
+    SDO_RESPONSE,
+    STOP,
+    Bench,
+    eds_with,
+)
 
 from canwall.simdrive.abort import AbortCode
 
+SAVE = int.from_bytes(b"save", "little")
 DEVICE_NAME = b"canwall simulated servo drive"
 
 MORE_OBJECTS = """
@@ -76,7 +85,8 @@ PDOMapping=1
 
 @pytest.fixture
 def more(tmp_path: Path) -> Bench:
-    return Bench(eds_with(tmp_path, MORE_OBJECTS))
+    """With objects of every type, and a memory that cannot be written."""
+    return Bench(eds_with(tmp_path, MORE_OBJECTS), tmp_path / "none" / "stored.json")
 
 
 def initiate(head: int, index: int, subindex: int, payload: bytes = b"") -> bytes:
@@ -338,6 +348,7 @@ ABORTS: list[tuple[AbortCode, Callable[[Bench], object]]] = [
     (AbortCode.DEVICE_STATE, lambda bench: bench.write(0x1A00, 0, 0, 1)),
     (AbortCode.DEVICE_STATE, lambda bench: bench.write(0x1014, 0, 0x90, 4)),
     (AbortCode.NOT_STORED, lambda bench: bench.write(0x1010, 1, 1, 4)),
+    (AbortCode.HARDWARE, lambda bench: bench.write(0x1010, 1, SAVE, 4)),
     (AbortCode.NO_DATA, lambda bench: bench.read(0x1003, 1)),
 ]
 
@@ -350,6 +361,13 @@ def test_abort(more: Bench, code: AbortCode, access: Callable[[Bench], object]) 
     assert more.read(0x1000) == 0x00020192  # the server is ready again
 
 
-def test_every_abort_code_is_seen() -> None:
-    elsewhere = {AbortCode.HARDWARE}  # test_store.py
-    assert {code for code, _ in ABORTS} | elsewhere == set(AbortCode)
+def test_every_abort_code_is_seen_on_the_bus(more: Bench) -> None:
+    for _, access in ABORTS:
+        with pytest.raises(SdoAbortedError):
+            access(more)
+    seen = {
+        AbortCode(struct.unpack_from("<L", data, 4)[0])
+        for can_id, data in more.sent
+        if can_id == SDO_RESPONSE and data[0] == 0x80
+    }
+    assert seen == set(AbortCode)

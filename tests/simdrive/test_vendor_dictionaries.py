@@ -1,8 +1,6 @@
 """The drive with the dictionaries of drives that can be bought."""
 
 import struct
-from dataclasses import dataclass
-from pathlib import Path
 
 import canopen
 import pytest
@@ -20,60 +18,24 @@ from simdrive_bench import (
     TPDO,
     Bench,
 )
+from vendors import SIMULATION, VENDORS, ConfiguredBench, Vendor, path_of
 
-from canwall.config import Drive as DriveSettings
-from canwall.config import Simulation
 from canwall.eds import load_eds
-from canwall.simdrive import make_drive
-
-FOLDER = Path(__file__).parents[3] / "shared" / "vendor-eds"
-
-
-@dataclass(frozen=True)
-class Vendor:
-    """A file, and what its drive is to be like."""
-
-    file: str
-    modes: tuple[int, ...]
-    lacks: tuple[int, ...]
-    rated_torque_mnm: float
-    counts_per_rev: float
-
-
-VENDORS = [
-    Vendor("maxon_epos4_0x1018.eds", (10,), (0x6072, 0x608F, 0x6091), 1250, 4000),
-    Vendor("elmo_gold.dcf", (10, 4), (0x1005, 0x1007), 1250, 1),
-    Vendor("nanotec_C5-E-2-09.eds", (10, 4), (0x6076, 0x60E0), 1250, 4000),
-    Vendor("technosoft_iPOS.D.v1.04.eds", (10,), (0x1016, 0x6072, 0x6076), 1250, 4000),
-    Vendor("ingenia_eve-net-c_1.8.1.eds", (10,), (0x1016, 0x6087), 1000, 4000),
-]
-SIMULATION = Simulation(rated_torque_nm=1.25, counts_per_rev=4000)
 
 
 @pytest.fixture(params=VENDORS, ids=lambda vendor: vendor.file)
 def vendor(request: pytest.FixtureRequest) -> Vendor:
     assert isinstance(request.param, Vendor)
-    if not (FOLDER / request.param.file).is_file():
-        pytest.skip(f"{FOLDER} has no {request.param.file}")
+    path_of(request.param.file)
     return request.param
 
 
-class VendorBench(Bench):
-    """A drive as the configuration describes it, with one of the dictionaries."""
-
-    def __init__(self, vendor: Vendor) -> None:
-        self.path = FOLDER / vendor.file
-        settings = DriveSettings(node_id=NODE_ID, eds=self.path)
-        self.drive = make_drive(settings, SIMULATION, 0.001)
-        self.sent = self.drive.boot()
-
-
 @pytest.fixture
-def of_vendor(vendor: Vendor) -> VendorBench:
-    return VendorBench(vendor)
+def of_vendor(vendor: Vendor) -> ConfiguredBench:
+    return ConfiguredBench(path_of(vendor.file))
 
 
-def test_keeps_exactly_that_dictionary(vendor: Vendor, of_vendor: VendorBench) -> None:
+def test_keeps_exactly_that_dictionary(vendor: Vendor, of_vendor: ConfiguredBench) -> None:
     od = load_eds(of_vendor.path, NODE_ID)
     for index in (*range(0x1000, 0x1030), *range(0x6000, 0x6600), *vendor.lacks):
         request = struct.pack("<BHB4x", 0x40, index, 0)
@@ -99,7 +61,7 @@ def readable(od: canopen.ObjectDictionary) -> list[tuple[int, int]]:
     ]
 
 
-def test_answers_sdo(of_vendor: VendorBench) -> None:
+def test_answers_sdo(of_vendor: ConfiguredBench) -> None:
     no_error_yet = 0x1003
     for key in readable(load_eds(of_vendor.path, NODE_ID)):
         if key[0] != no_error_yet:
@@ -117,7 +79,7 @@ def configure(bench: Bench, index: int, cob_id: int, mapping: list[int]) -> None
     bench.write(index, 1, cob_id, 4)
 
 
-def test_is_enabled_and_driven(vendor: Vendor, of_vendor: VendorBench) -> None:
+def test_is_enabled_and_driven(vendor: Vendor, of_vendor: ConfiguredBench) -> None:
     bench = of_vendor
     bench.tick()
     configure(bench, 0x1400, RPDO[1], [CONTROLWORD, TARGET_TORQUE])
@@ -141,18 +103,18 @@ def test_is_enabled_and_driven(vendor: Vendor, of_vendor: VendorBench) -> None:
 
 
 @pytest.mark.parametrize("mode", [1, 3, 6, 7, 8, 9])
-def test_modes_without_torque_are_refused(of_vendor: VendorBench, mode: int) -> None:
+def test_modes_without_torque_are_refused(of_vendor: ConfiguredBench, mode: int) -> None:
     with pytest.raises(SdoAbortedError, match="06090030"):
         of_vendor.write(0x6060, 0, mode, 1)
 
 
-def test_supported_modes_are_shown(vendor: Vendor, of_vendor: VendorBench) -> None:
+def test_supported_modes_are_shown(vendor: Vendor, of_vendor: ConfiguredBench) -> None:
     shown = of_vendor.read(0x6502)
     if load_eds(of_vendor.path, NODE_ID)[0x6502].default is None:
         assert shown == sum(1 << mode - 1 for mode in vendor.modes)
 
 
-def test_units(vendor: Vendor, of_vendor: VendorBench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_units(vendor: Vendor, of_vendor: ConfiguredBench, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = of_vendor
     torques: list[float] = []
     motion = bench.drive._motion
