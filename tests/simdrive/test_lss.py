@@ -132,6 +132,7 @@ def test_without_a_node_id_there_is_lss_alone(unconfigured: Bench) -> None:
     assert ask(unconfigured, 0x4C) == [frame(0x50)]
     position = unconfigured.motion.position
     assert unconfigured.sync() == []
+    assert unconfigured.sync() == []
     assert unconfigured.motion.position != position  # the world goes on
 
 
