@@ -44,7 +44,13 @@ def _settings(path: Path | None, **overrides: Any) -> Settings:
 
 @app.command()
 def run(
-    config_file: _ConfigArgument = None,
+    config_files: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[CONFIG]...",
+            help="TOML files, one for each drive on the bus; without: config/sim.toml.",
+        ),
+    ] = None,
     law: Annotated[str | None, typer.Option(help="Law of the wall.")] = None,
     stiffness: Annotated[float | None, typer.Option(help="Stiffness [N·m/rad].")] = None,
     damping: Annotated[float | None, typer.Option(help="Damping [N·m·s/rad].")] = None,
@@ -53,10 +59,37 @@ def run(
 ) -> int:
     """Render the wall: enable the drive, run, record, disable it again.
 
-    --law also ends the changes of law that the file schedules.
+    Several files: as many drives on one bus, each with its wall, on one SYNC. --law also ends the
+    changes of law that the file schedules.
     """
+    files = config_files or [config.shipped("config/sim.toml")]
+    many = [_run_settings(path, law, stiffness, damping, duration) for path in files]
+    from canwall.run import run_together  # numba takes a second to load: not for --help
+
+    with _RunProgress() as shown:
+        results = run_together(many, output, shown.report, shown.advance)
+    for result in results:
+        _console.print(_strike_table(result.summary["strikes"]))
+        _console.print(f"record: {result.folder.path}", soft_wrap=True, highlight=False)
+        for note in result.notes:
+            _error(note)
+    outcome = results[0].outcome
+    for trip in outcome.trips:
+        _error(trip)
+    if outcome.trips or any(result.notes for result in results):
+        return FAILED
+    return INTERRUPTED if outcome.interrupted else 0
+
+
+def _run_settings(
+    path: Path,
+    law: str | None,
+    stiffness: float | None,
+    damping: float | None,
+    duration: float | None,
+) -> Settings:
     settings = _settings(
-        config_file,
+        path,
         wall__law=law and absolute_law(law, Path()),
         wall__stiffness_nm_per_rad=stiffness,
         wall__damping_nm_s_per_rad=damping,
@@ -65,19 +98,7 @@ def run(
     if law is not None:
         kept = tuple(change.model_copy(update={"law": None}) for change in settings.schedule)
         settings = settings.model_copy(update={"schedule": kept})
-    from canwall.run import run as run_wall  # numba takes a second to load: not for --help
-
-    with _RunProgress() as shown:
-        result = run_wall(settings, output, shown.report, shown.advance)
-    _console.print(_strike_table(result.summary["strikes"]))
-    _console.print(f"record: {result.folder.path}", soft_wrap=True, highlight=False)
-    for note in result.notes:
-        _error(note)
-    for trip in result.outcome.trips:
-        _error(trip)
-    if result.outcome.trips or result.notes:
-        return FAILED
-    return INTERRUPTED if result.outcome.interrupted else 0
+    return settings
 
 
 @app.command()

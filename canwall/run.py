@@ -6,8 +6,9 @@ Prepare everything that can fail on bad input, then touch the bus, then the driv
 import json
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +23,16 @@ from canwall.compiled import Record, compiled
 from canwall.config import ConfigError, Settings
 from canwall.cycle import (
     MAX_LAWS,
+    Axis,
     Change,
+    ExternalSync,
     Outcome,
     PythonCanExchange,
-    make_cycle,
+    Watch,
     run_loop,
     timing_summary,
 )
-from canwall.drive import REQUIRED_OBJECTS, DriveNode, DriveSetup, Link, set_up
+from canwall.drive import REQUIRED_OBJECTS, DriveError, DriveNode, DriveSetup, Link, set_up
 from canwall.eds import load_eds
 from canwall.errors import RunFailedError
 from canwall.physics import advance, make_plant
@@ -108,56 +111,63 @@ def drive_dictionary(settings: Settings) -> ObjectDictionary:
     return load_eds(settings.drive.eds, settings.drive.node_id, REQUIRED_OBJECTS)
 
 
-@dataclass(frozen=True)
-class Bench:
-    """A drive that is set up, and the cycle that will render the wall on it."""
-
-    node: DriveNode
-    setup: DriveSetup
-    cycle: NDArray[np.void]
-    exchange: PythonCanExchange
-
-
-def set_up_bench(
+def make_axis(
     link: Link,
     settings: Settings,
     dictionary: ObjectDictionary,
     laws: Sequence[Law],
     ring: Ring,
-) -> Bench:
+) -> Axis:
     """Set the drive up for its wall, the rows of its cycles going into the ring.
 
     `dictionary` is what `[drive] eds` describes. Nothing is enabled yet. Raises DriveError.
     """
     node = DriveNode(link, settings.drive.node_id, dictionary)
     setup = set_up(node, settings.drive)
-    cycle = make_cycle(settings, setup, laws)
-    exchange = PythonCanExchange(link, setup, cycle, ring, settings.real_time)
-    return Bench(node, setup, cycle, exchange)
+    period = settings.bus.cycle_s
+    changes = [
+        Change(round(at_s / period), wall, limits) for at_s, wall, limits in settings.stages[1:]
+    ]
+    return Axis(node, setup, settings, laws, ring, changes)
+
+
+def make_exchange(link: Link, axes: Sequence[Axis]) -> PythonCanExchange:
+    """The cycle of all axes, on the SYNC that `[bus]` says. Raises DriveError."""
+    settings, setup = axes[0].settings, axes[0].setup
+    for axis in axes[1:]:
+        other = axis.setup
+        if (other.sync_cob_id, other.sync_counter_overflow) != (
+            setup.sync_cob_id,
+            setup.sync_counter_overflow,
+        ):
+            raise DriveError(
+                f"{axis.name} wants another SYNC than {axes[0].name}: make 0x1005 and 0x1019 equal"
+            )
+    sync = None
+    if settings.bus.sync == "external":
+        sync = ExternalSync(link, setup.sync_cob_id, settings.bus.cycle_s)
+    return PythonCanExchange(link, axes, settings.real_time, sync)
+
+
+def make_watch(link: Link, axes: Sequence[Axis]) -> Watch:
+    """What ends the walls beside the cycle; a second SYNC as well, where the master sends it."""
+    external = axes[0].settings.bus.sync == "external"
+    return Watch(link, axes, None if external else axes[0].setup.sync_cob_id)
 
 
 def render(
-    bench: Bench,
-    settings: Settings,
-    laws: Sequence[Law],
+    exchange: PythonCanExchange,
     stop: Callable[[], bool],
     progress: Callable[[float], None] = lambda now_s: None,
 ) -> Outcome:
-    """Enable the drive, render the wall for `[run] duration_s` or until stopped, disable it.
+    """Enable the drives, render the walls for `[run] duration_s` or until stopped, disable them.
 
     progress is told the seconds of bus time about every 100 ms of them.
     """
+    settings = exchange.axes[0].settings
     period, end_s = settings.bus.cycle_s, settings.run.duration_s
-    return run_loop(
-        bench.exchange,
-        bench.cycle,
-        bench.node,
-        laws,
-        [Change(round(at_s / period), wall) for at_s, wall in settings.walls[1:]],
-        None if end_s is None else round(end_s / period),
-        stop,
-        lambda j: progress(j * period),
-    )
+    cycles = None if end_s is None else round(end_s / period)
+    return run_loop(exchange, cycles, stop, lambda j: progress(j * period))
 
 
 @dataclass(frozen=True)
@@ -182,46 +192,115 @@ def run(
     ConfigError and DictionaryError before anything is enabled, DriveError where the drive cannot
     be set up, RunFailedError where no cycle came about or none was recorded.
     """
-    laws = run_laws(settings)
-    dictionary = drive_dictionary(settings)
-    with on_the_bus(settings) as link:
-        folder = RunFolder.create(output)
-        folder.config.write_text(settings.to_toml(), encoding="utf-8")
-        names = [law.name for law in laws]
-        recorder = Recorder(folder.path, settings.run.bus_log, settings.bus.channel, names)
+    (result,) = run_together([settings], output, report, progress)
+    return result
+
+
+def run_together(
+    many: Sequence[Settings],
+    output: Path | None,
+    report: Callable[[str], None] = lambda what: None,
+    progress: Callable[[float, float | None], None] = lambda now_s, end_s: None,
+) -> list[RunResult]:
+    """`run` for several drives on one bus, each with its wall, on one SYNC.
+
+    Their `[bus]` and `[run]` have to be the same. Each drive's record has a folder of its own,
+    `node5` …; the bus log lies beside these folders.
+    """
+    _check_together(many)
+    laws = [run_laws(settings) for settings in many]
+    dictionaries = [drive_dictionary(settings) for settings in many]
+    first = many[0]
+    with on_the_bus(*many) as link:
+        folders = _run_folders(many, output)
+        recorders: list[Recorder] = []
+        notes: list[list[str]] = []
         try:
-            link.log = recorder.ring.log_frame
-            report("setting up the drive")
-            bench = set_up_bench(link, settings, dictionary, laws, recorder.ring)
+            for settings, folder, known in zip(many, folders, laws, strict=True):
+                folder.config.write_text(settings.to_toml(), encoding="utf-8")
+                # One log of the bus for all of them.
+                log = first.run.bus_log if len(many) == 1 else f"../{first.run.bus_log}"
+                names = [law.name for law in known]
+                recorders.append(
+                    Recorder(folder.path, None if recorders else log, first.bus.channel, names)
+                )
+            link.log = recorders[0].ring.log_frame
+            report("setting up the drive" if len(many) == 1 else "setting up the drives")
+            axes = [
+                make_axis(link, settings, dictionary, known, recorder.ring)
+                for settings, dictionary, known, recorder in zip(
+                    many, dictionaries, laws, recorders, strict=True
+                )
+            ]
+            exchange = make_exchange(link, axes)
+            watch = make_watch(link, axes)
             report("rendering")
             with stop_on_signals() as stop:
                 outcome = render(
-                    bench,
-                    settings,
-                    laws,
-                    stop,
-                    lambda now_s: progress(now_s, settings.run.duration_s),
+                    exchange, stop, lambda now_s: progress(now_s, first.run.duration_s)
                 )
         finally:
-            notes = recorder.close()
+            notes = [recorder.close() for recorder in recorders]
     report("summarising")
+    results = []
+    for axis, folder, noted in zip(axes, folders, notes, strict=True):
+        said = [*noted, *watch.notes] if axis is axes[0] else noted
+        results.append(_result(axis, exchange, watch, folder, outcome, said))
+    return results
+
+
+def _check_together(many: Sequence[Settings]) -> None:
+    first = many[0]
+    for settings in many[1:]:
+        for section in ("bus", "run"):
+            if getattr(settings, section) != getattr(first, section):
+                raise ConfigError(
+                    f"[{section}] differs between the configurations: drives that run together "
+                    "share the bus and its SYNC; make the sections equal"
+                )
+    nodes = [settings.drive.node_id for settings in many]
+    if len(set(nodes)) < len(nodes):
+        raise ConfigError(f"drive.node_id: {nodes}: every drive needs one of its own")
+
+
+def _run_folders(many: Sequence[Settings], output: Path | None) -> list[RunFolder]:
+    if len(many) == 1:
+        return [RunFolder.create(output)]
+    base = output or RunFolder.default_path()
+    return [RunFolder.create(base / f"node{settings.drive.node_id}") for settings in many]
+
+
+def _result(
+    axis: Axis,
+    exchange: PythonCanExchange,
+    watch: Watch,
+    folder: RunFolder,
+    outcome: Outcome,
+    notes: list[str],
+) -> RunResult:
+    """Summary and pictures of one axis."""
+    settings = axis.settings
     signals = _recorded(folder, [*outcome.trips, *notes])
     asked_for = (signals[name].to_numpy() for name in ("stiffness", "damping", "wall_position_rad"))
     referent = referent_positions(settings, *asked_for)
-    summary = summarise(signals, settings, bench.setup.units, referent)
+    summary = summarise(signals, settings, axis.setup.units, referent)
     summary |= {
-        "missed_tpdo": int(bench.cycle["missed_tpdo"][0]),
-        "late_rpdo": bench.exchange.late_rpdo,
+        "missed_tpdo": int(axis.cycle["missed_tpdo"][0]),
+        "late_rpdo": axis.late_rpdo,
+        "error_frames": watch.error_frames,
         "trips": outcome.trips,
+        "trip_cycle": outcome.trip_cycle,
         "interrupted": outcome.interrupted,
-        "drive": _described(bench.setup),
+        "delay_cycles": axis.delay,
+        "drive": _described(axis.setup),
         "timing": {
-            "sync_interval": timing_summary(bench.exchange.sync_interval),
-            "tpdo_to_rpdo": timing_summary(bench.exchange.latency),
+            "sync_interval": timing_summary(exchange.sync_interval),
+            "tpdo_to_rpdo": timing_summary(axis.latency),
         },
     }
     folder.summary.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    report("drawing")
+    if outcome.trip_cycle is not None:
+        folder.write_trip(signals, outcome.trip_cycle)
     plot_run(folder)
     return RunResult(folder, summary, outcome, notes)
 
@@ -243,7 +322,8 @@ def run_laws(settings: Settings) -> list[Law]:
     Raises ConfigError for a law that is not there or has not the options that it is given.
     """
     laws: dict[str, Law] = {}
-    for _, wall in settings.walls:
+    walls = [wall for stage in settings.stages for wall in settings.laws_in_turn(stage.wall)]
+    for wall in walls:
         try:
             law = find_law(wall.law, wall.deadbeat)
             law.option_values(wall.options)
@@ -256,18 +336,28 @@ def run_laws(settings: Settings) -> list[Law]:
 
 
 @contextmanager
-def on_the_bus(settings: Settings) -> Iterator[Link]:
-    """A link to the bus; an embedded drive lives on the same bus, in the master's idle time.
+def on_the_bus(*many: Settings) -> Iterator[Link]:
+    """A link to the bus; embedded drives live on the same bus, in the master's idle time.
 
     Raises ConfigError and DictionaryError.
     """
-    if not settings.embedded:
-        with open_bus(settings) as bus:
+    if not many[0].embedded:
+        with open_bus(many[0]) as bus:
             yield Link(bus)
         return
-    drive = make_simulated_drive(settings)
-    with open_bus(settings) as bus, open_bus(settings) as drive_bus:
-        yield Link(bus, idle=simdrive.BusRunner(drive, drive_bus).poll)
+    drives = [make_simulated_drive(settings) for settings in many]
+    with ExitStack() as stack:
+        bus = stack.enter_context(open_bus(many[0]))
+        polls = [
+            simdrive.BusRunner(drive, stack.enter_context(open_bus(settings))).poll
+            for drive, settings in zip(drives, many, strict=True)
+        ]
+        yield Link(bus, idle=polls[0] if len(polls) == 1 else partial(_call_all, polls))
+
+
+def _call_all(functions: Sequence[Callable[[], None]]) -> None:
+    for function in functions:
+        function()
 
 
 def _described(setup: DriveSetup) -> dict[str, float]:

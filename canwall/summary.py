@@ -34,7 +34,7 @@ def summarise(
     chattering = [s for s in strikes if s["chatter"]]
     torque = signals["torque_cmd"].to_numpy()
     return {
-        "law": list(dict.fromkeys(wall.law for _, wall in settings.walls)),
+        "law": list(dict.fromkeys(stage.wall.law for stage in settings.stages)),
         "stiffness": settings.wall.stiffness_nm_per_rad,
         "damping": settings.wall.damping_nm_s_per_rad,
         "cycle_s": settings.bus.cycle_s,

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from canwall import config, simdrive
 from canwall.config import Settings
-from canwall.cycle import Change, Outcome, PythonCanExchange, make_cycle, run_loop
+from canwall.cycle import Axis, Change, Outcome, PythonCanExchange, run_loop
 from canwall.drive import REQUIRED_OBJECTS, DriveNode, DriveSetup, Link, set_up
 from canwall.eds import load_eds
 from canwall.record import Ring
-from canwall.run import run_laws
+from canwall.run import make_watch, run_laws
 
 SIM_CONFIG = config.shipped("config/sim.toml")
 SYNC, TPDO1, RPDO1, SDO_REQUEST, SDO_ANSWER = 0x080, 0x185, 0x205, 0x605, 0x585
@@ -136,26 +136,22 @@ class Loop:
         self.rig = rig
         self.laws = run_laws(rig.settings)
         self.setup = rig.set_up()
-        self.record = make_cycle(rig.settings, self.setup, self.laws)
         self.ring = Ring.create()
-        self.exchange = PythonCanExchange(rig.link, self.setup, self.record, self.ring, real_time)
+        self.axis = Axis(rig.node, self.setup, rig.settings, self.laws, self.ring)
+        self.record = self.axis.cycle
+        self.exchange = PythonCanExchange(rig.link, [self.axis], real_time)
+        self.watch = make_watch(rig.link, [self.axis])
 
     def run(
         self,
         cycles: int | None,
         stop: Callable[[int], bool] = lambda j: False,
         changes: list[Change] | None = None,
+        progress: Callable[[int], None] = lambda j: None,
     ) -> Outcome:
         """`stop` is asked once a cycle, with the cycle: a place to do things as well."""
-        return run_loop(
-            self.exchange,
-            self.record,
-            self.rig.node,
-            self.laws,
-            changes or [],
-            cycles,
-            lambda: stop(int(self.record["j"][0])),
-        )
+        self.axis.changes = changes or []
+        return run_loop(self.exchange, cycles, lambda: stop(int(self.record["j"][0])), progress)
 
     def rows(self) -> NDArray[np.void]:
         """One row per cycle so far."""

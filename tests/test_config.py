@@ -72,7 +72,7 @@ def test_the_least_that_is_enough(loaded: Load) -> None:
     assert found.bus.cycle_s == 0.001
     assert found.drive.node_id == 5
     assert found.simulation is None
-    assert found.walls == [(0.0, Wall())]
+    assert found.stages == [(0.0, Wall(), found.limits)]
 
 
 REFUSED: list[tuple[dict[str, object], str]] = [
@@ -135,7 +135,7 @@ REFUSED: list[tuple[dict[str, object], str]] = [
         {"wall.stifness_nm_per_rad": 5},
         "wall.stifness_nm_per_rad: unknown key; did you mean stiffness_nm_per_rad?",
     ),
-    ({"limits.zzz": 1}, "limits.zzz: unknown key; known here: torque_nm, speed_rad_s"),
+    ({"limits.zzz": 1}, "limits.zzz: unknown key; known here: torque_nm, torque_rate_nm_per_s"),
     ({"simulation.hand.strike": 4}, "simulation.hand.strike: unknown key; did you mean strikes?"),
     ({"schedule": [{"at_s": 1, "lwa": "x"}]}, "schedule.0.lwa: unknown key; did you mean law?"),
     # what does not go together
@@ -315,7 +315,7 @@ def test_a_wall_at_the_handle_is_turned_into_angles(loaded: Load) -> None:
     # 1 N at the handle is r N·m at the shaft, 1 m there 1/r rad.
     assert found.wall.stiffness_nm_per_rad == pytest.approx(5000 * radius**2)
     assert found.wall.damping_nm_s_per_rad == pytest.approx(10 * radius**2)
-    _, later = found.walls[1]
+    later = found.stages[1].wall
     assert later.stiffness_nm_per_rad == pytest.approx(1000 * radius**2)
     assert later.position_rad == pytest.approx(-0.1)
     assert later.damping_nm_s_per_rad == found.wall.damping_nm_s_per_rad
@@ -365,8 +365,8 @@ def test_the_schedule_changes_only_what_it_names(loaded: Load) -> None:
             ],
         }
     )
-    instants = [at_s for at_s, _ in found.walls]
-    walls = [wall for _, wall in found.walls]
+    instants = [stage.at_s for stage in found.stages]
+    walls = [stage.wall for stage in found.stages]
     assert instants == [0.0, 1.0, 2.5, 2.5, 4.0]
     assert [w.law for w in walls] == ["standard", "damped", "damped", "damped", "damped"]
     assert [w.stiffness_nm_per_rad for w in walls] == [10.0, 10.0, 0.0, 0.0, 0.0]

@@ -133,7 +133,7 @@ def test_torque_recomputed_from_the_frames_alone(four_strikes: Record) -> None:
     units = DriveUnits(counts_per_rev=131072, rated_torque_nm=0.637)
     laws = run_laws(settings)
     cycle = make_cycle(settings, DriveSetup(units, SYNC, tpdo, rpdo), laws)
-    changes = [(round(at_s / 0.001), wall) for at_s, wall in settings.walls[1:]]
+    changes = [(round(stage.at_s / 0.001), stage.wall) for stage in settings.stages[1:]]
     row = np.zeros(1, ROW)
     enabled = False
     recomputed = []

@@ -14,6 +14,7 @@ from canwall.config.settings import (
     Mechanics,
     Run,
     Settings,
+    Stage,
     Wall,
 )
 from canwall.config.simulation import Hand, Simulation
@@ -30,6 +31,7 @@ __all__ = [
     "Run",
     "Settings",
     "Simulation",
+    "Stage",
     "Wall",
     "absolute_law",
     "load",

@@ -81,7 +81,11 @@ def load(path: Path, overrides: Mapping[str, Any] | None = None) -> Settings:
 def _with_absolute_paths(settings: Settings, base: Path) -> Settings:
     """The files that a configuration names, independent of where it lies."""
     drive = settings.drive.model_copy(update={"eds": (base / settings.drive.eds).resolve()})
-    wall = settings.wall.model_copy(update={"law": absolute_law(settings.wall.law, base)})
+    laws = {
+        "law": absolute_law(settings.wall.law, base),
+        "alternate": tuple(absolute_law(law, base) for law in settings.wall.alternate),
+    }
+    wall = settings.wall.model_copy(update=laws)
     schedule = tuple(
         change.model_copy(update={"law": change.law and absolute_law(change.law, base)})
         for change in settings.schedule

@@ -1,7 +1,7 @@
 """The sections of a configuration, and what they say together."""
 
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, NamedTuple, Self
 
 import tomli_w
 from pydantic import Field, field_validator, model_validator
@@ -18,6 +18,7 @@ class Bus(Section):
     bitrate: int = Field(1_000_000, gt=0)
     cycle_s: Annotated[Positive, Field(le=1.0)] = 0.001
     pace: Literal["auto", "real_time", "simulated"] = "auto"
+    sync: Literal["produce", "external"] = "produce"
 
 
 class Drive(Section):
@@ -60,20 +61,40 @@ class Wall(Section):
     options: dict[str, Number] = Field(default_factory=dict)
     tension: Literal["allow", "clamp", "budget"] = "allow"
     passivity_nm_s_per_rad: NonNegative = 0.0
+    divider: int = Field(1, ge=1, le=1000)
+    alternate: tuple[str, ...] = ()
+
+    @field_validator("alternate", mode="before")
+    @classmethod
+    def _laws(cls, value: object) -> object:
+        return tuple(value) if isinstance(value, list) else value
 
 
 class Estimator(Section):
-    """`[estimator]`: how fast the operator's force may change, for the Kalman filter."""
+    """`[estimator]`: the Kalman filter: how fast the operator's force may change, and the delay.
+
+    delay_cycles is D, from the sampling of a position to the torque computed from it taking
+    effect, in cycles. Where it is not given it is 1 with synchronous PDOs; with others, or with
+    measure_delay, it is measured before the wall is rendered, by small torques of
+    measure_torque_nm for measure_cycles.
+    """
 
     force_walk_nm_per_sqrt_s: Annotated[Positive, Field(ge=1e-4, le=100.0)] = 0.2
+    delay_cycles: Annotated[Number, Field(ge=0, le=3)] | None = None
+    measure_delay: bool = False
+    measure_torque_nm: Positive = 0.15
+    measure_cycles: int = Field(400, ge=100, le=10_000)
 
 
 class Limits(Section):
-    """`[limits]`: torque is held to its limit; speed and position beyond theirs end the run."""
+    """`[limits]`: torque and its rate are held to theirs; beyond the others the run ends."""
 
     torque_nm: Positive
+    torque_rate_nm_per_s: Positive | None = None
     speed_rad_s: Positive = 60.0
     position_rad: tuple[Number, Number] = (-3.0, 3.0)
+    energy_j: Positive | None = None
+    emergency: Literal["trip", "note"] = "trip"
     hold_cycles: int = Field(2, ge=0, le=100)
     ramp_cycles: int = Field(10, ge=1, le=1000)
 
@@ -91,14 +112,25 @@ class Limits(Section):
 
 
 class Run(Section):
-    """`[run]`: how long, and in which format the bus log is kept."""
+    """`[run]`: how long, how gently walls come and change, the format of the bus log."""
 
     duration_s: Positive | None = None
+    ramp_in_s: NonNegative = 0.5
+    blend_s: NonNegative = 0.05
     bus_log: Literal["bus.log", "bus.asc", "bus.blf", "bus.csv", "bus.trc", "bus.db"] = "bus.log"
 
 
+class LimitsChange(Section):
+    """What a schedule may change of `[limits]`."""
+
+    torque_nm: Positive | None = None
+    torque_rate_nm_per_s: Positive | None = None
+    speed_rad_s: Positive | None = None
+    energy_j: Positive | None = None
+
+
 class Change(Section):
-    """`[[schedule]]`: from at_s on, these keys of `[wall]` have these values."""
+    """`[[schedule]]`: from at_s on, these keys of `[wall]` (and `limits`) have these values."""
 
     at_s: NonNegative
     law: str | None = None
@@ -110,6 +142,16 @@ class Change(Section):
     options: dict[str, Number] | None = None
     tension: Literal["allow", "clamp", "budget"] | None = None
     passivity_nm_s_per_rad: NonNegative | None = None
+    divider: Annotated[int, Field(ge=1, le=1000)] | None = None
+    limits: LimitsChange | None = None
+
+
+class Stage(NamedTuple):
+    """Wall and limits in force from at_s on."""
+
+    at_s: float
+    wall: Wall
+    limits: Limits
 
 
 class Settings(Section):
@@ -134,26 +176,39 @@ class Settings(Section):
     def _consistent(self) -> Self:
         if [c.at_s for c in self.schedule] != sorted(c.at_s for c in self.schedule):
             raise ValueError("schedule: the entries have to be in the order of at_s")
+        if self.wall.alternate and any(change.law for change in self.schedule):
+            raise ValueError("schedule: changes the law, and so does wall.alternate; keep one")
         low, high = self.limits.position_rad
         sections = ("wall", *(f"schedule.{i}" for i in range(len(self.schedule))))
-        for section, (_, wall) in zip(sections, self.walls, strict=True):
-            if not low < wall.position_rad < high:
+        for section, stage in zip(sections, self.stages, strict=True):
+            if not low < stage.wall.position_rad < high:
                 raise ValueError(
-                    f"{section}.position_rad = {wall.position_rad:g} lies outside "
+                    f"{section}.position_rad = {stage.wall.position_rad:g} lies outside "
                     f"limits.position_rad = [{low:g}, {high:g}]"
                 )
         return self
 
     @property
-    def walls(self) -> list[tuple[float, Wall]]:
-        """The wall in force from each instant on: (at_s, wall), the first at 0."""
-        timeline = [(0.0, self.wall)]
+    def stages(self) -> list[Stage]:
+        """Wall and limits from each instant on, the first from 0."""
+        timeline = [Stage(0.0, self.wall, self.limits)]
         for change in self.schedule:
-            update = change.model_dump(exclude={"at_s"}, exclude_none=True)
+            update = change.model_dump(exclude={"at_s", "limits"}, exclude_none=True)
             if change.law is not None:
                 update.setdefault("options", {})  # they were the other law's
-            timeline.append((change.at_s, timeline[-1][1].model_copy(update=update)))
+            wall, limits = timeline[-1].wall.model_copy(update=update), timeline[-1].limits
+            if change.limits is not None:
+                limits = limits.model_copy(update=change.limits.model_dump(exclude_none=True))
+            timeline.append(Stage(change.at_s, wall, limits))
         return timeline
+
+    def laws_in_turn(self, wall: Wall) -> list[Wall]:
+        """The walls that take turns from strike to strike: this one, and those of `alternate`.
+
+        Options are the law's own; the others go with their defaults.
+        """
+        others = [wall.model_copy(update={"law": law, "options": {}}) for law in wall.alternate]
+        return [wall, *others]
 
     @property
     def embedded(self) -> bool:

@@ -1,19 +1,28 @@
 """The SYNC-driven loop: exchange of frames, one compiled step, timing, limits and trips."""
 
+from canwall.cycle.axis import Axis, Change
+from canwall.cycle.delay import measured_delay
 from canwall.cycle.exchange import PythonCanExchange
-from canwall.cycle.loop import Change, Outcome, run_loop
+from canwall.cycle.loop import Outcome, run_loop
 from canwall.cycle.step import CYCLE, MAX_LAWS, Trip, make_cycle, set_wall, step
+from canwall.cycle.sync import ExternalSync, ProducedSync
 from canwall.cycle.timing import HISTOGRAM, observe_ns, percentile_ns, timing_summary
+from canwall.cycle.watch import Watch
 
 __all__ = [
     "CYCLE",
     "HISTOGRAM",
     "MAX_LAWS",
+    "Axis",
     "Change",
+    "ExternalSync",
     "Outcome",
+    "ProducedSync",
     "PythonCanExchange",
     "Trip",
+    "Watch",
     "make_cycle",
+    "measured_delay",
     "observe_ns",
     "percentile_ns",
     "run_loop",

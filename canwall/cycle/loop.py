@@ -2,23 +2,22 @@
 
 Every exit (time is up, Ctrl-C, a trip, an exception, a bus that fails) goes through `_leave`:
 torque zero from the very next RPDO, then the CiA 402 state machine down to SWITCH ON DISABLED.
+With several axes, what ends one ends all.
 """
 
 import gc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import can
-import numpy as np
-from numpy.typing import NDArray
 
-from canwall.config import Wall
+from canwall.cycle.axis import Axis, Change
+from canwall.cycle.delay import DelayTest
 from canwall.cycle.exchange import PythonCanExchange
-from canwall.cycle.step import Trip, set_wall, start_at
+from canwall.cycle.step import Trip, fade_in, fade_over, set_delay, set_limits, set_wall, start_at
 from canwall.drive import (
     Controlword,
     DriveError,
-    DriveNode,
     State,
     controlword_down,
     controlword_up,
@@ -26,7 +25,6 @@ from canwall.drive import (
 )
 from canwall.drive import objects as od
 from canwall.record import Phase
-from canwall.walls import Law
 
 #: Cycles within which a drive has to reach OPERATION ENABLED, and to leave it.
 _ENABLE_CYCLES = 2000
@@ -39,14 +37,6 @@ _DISABLED = (State.SWITCH_ON_DISABLED, State.FAULT)
 _FIRST_CYCLES = 10
 
 
-@dataclass(frozen=True)
-class Change:
-    """From cycle j on, this is the wall."""
-
-    j: int
-    wall: Wall
-
-
 @dataclass
 class Outcome:
     """How the loop ended."""
@@ -54,6 +44,8 @@ class Outcome:
     cycles: int = 0
     interrupted: bool = False
     trips: list[str] = field(default_factory=list)
+    trip_cycle: int | None = None
+    """The cycle at which a limit was passed, or a report ended the wall."""
     disabled: bool = False
 
 
@@ -63,21 +55,16 @@ class _WallGivenUpError(Exception):
 
 def run_loop(
     exchange: PythonCanExchange,
-    cycle: NDArray[np.void],
-    node: DriveNode,
-    laws: Sequence[Law],
-    changes: Sequence[Change],
     cycles: int | None,
     stop: Callable[[], bool],
     progress: Callable[[int], None] = lambda j: None,
 ) -> Outcome:
-    """Enable the drive, render the wall for `cycles` SYNCs (None: until stopped), disable it.
+    """Enable the drives, render the walls for `cycles` SYNCs (None: until stopped), disable them.
 
-    cycle is the record that the exchange works on; changes are in the order of j; stop is asked
-    once a cycle; progress is told the cycle about every 100 ms of bus time.
+    stop is asked once a cycle; progress is told the cycle about every 100 ms of bus time.
     """
     outcome = Outcome()
-    loop = _Loop(exchange, cycle, node, laws, list(changes), stop, progress)
+    loop = _Loop(exchange, stop, progress)
     # A collection would stop the cycle for milliseconds; nothing in it makes reference cycles.
     gc.collect()
     gc.freeze()
@@ -87,8 +74,10 @@ def run_loop(
         outcome.interrupted = loop.render(cycles)
     except _WallGivenUpError as trip:
         outcome.trips.append(str(trip))
+        outcome.trip_cycle = loop.j - 1
     except can.CanError as error:
         outcome.trips.append(f"the bus failed: {error}")
+        outcome.trip_cycle = loop.j
     finally:
         try:
             _leave(loop, outcome)
@@ -118,126 +107,209 @@ class _Loop:
     def __init__(
         self,
         exchange: PythonCanExchange,
-        cycle: NDArray[np.void],
-        node: DriveNode,
-        laws: Sequence[Law],
-        changes: list[Change],
         stop: Callable[[], bool],
         progress: Callable[[int], None],
     ) -> None:
         self._exchange = exchange
-        self._cycle = cycle
-        self._record = cycle[0]
-        self._node = node
-        self._laws = laws
-        self._changes = changes
+        self._axes = exchange.axes
         self._stop = stop
         self._progress = progress
-        self._progress_every = max(1, round(0.1 / float(cycle["period"][0])))
+        self._period = float(self._axes[0].cycle["period"][0])
+        self._progress_every = max(1, round(0.1 / self._period))
 
     @property
     def j(self) -> int:
-        return int(self._record["j"])
+        return int(self._axes[0].cycle["j"][0])
+
+    def _enter(self, phase: Phase) -> None:
+        for axis in self._axes:
+            axis.cycle["phase"] = phase
+
+    def _say(self, axis: Axis, text: str) -> str:
+        return text if len(self._axes) == 1 else f"{axis.name}: {text}"
 
     def enable(self) -> None:
-        """Zero torque and the state machine up; refuses to start inside the wall."""
-        self._record["phase"] = Phase.ENABLING
-        self._first_position()
+        """Zero torque and the state machines up."""
+        self._enter(Phase.ENABLING)
+        self._first_positions()
         for _ in range(_ENABLE_CYCLES):
             if self._stop():
                 return
-            state = state_of(int(self._record["statusword"]))
-            previous = int(self._record["controlword"])
-            self._record["controlword"] = controlword_up(state, previous)
-            if state is State.OPERATION_ENABLED:
+            enabled = [_is_enabled(axis) for axis in self._axes]
+            if all(enabled):
                 return
-            if self._silent():
-                raise _WallGivenUpError(f"no TPDO for {_SILENT_CYCLES} cycles while enabling")
+            for axis in self._axes:
+                if _is_silent(axis):
+                    silent = f"no TPDO for {_SILENT_CYCLES} cycles while enabling"
+                    raise _WallGivenUpError(self._say(axis, silent))
             self._exchange.cycle()
-        raise _WallGivenUpError(f"the drive stays in {self._state()}{self._emergency()}")
+        for axis in self._axes:
+            if not _is_enabled(axis):
+                stays = f"the drive stays in {_state(axis)}{_emergency(axis)}"
+                raise _WallGivenUpError(self._say(axis, stays))
 
-    def _first_position(self) -> None:
+    def _first_positions(self) -> None:
+        waiting = list(self._axes)
         for _ in range(_FIRST_CYCLES):
             self._exchange.cycle()
-            if self._exchange.row["received"][0]:
+            waiting = [axis for axis in waiting if not axis.row["received"][0]]
+            if not waiting:
                 break
         else:
-            raise _WallGivenUpError(f"no TPDO within {_FIRST_CYCLES} SYNCs")
-        start_at(self._cycle, int(self._record["counts"]))
-        y = float(self._exchange.row["y"][0])
-        if y < 0.0:
-            raise _WallGivenUpError(
-                f"the handle is {-y:.3g} rad inside the wall: move it out, or wall.position_rad"
-            )
+            raise _WallGivenUpError(self._say(waiting[0], f"no TPDO within {_FIRST_CYCLES} SYNCs"))
+        for axis in self._axes:
+            start_at(axis.cycle, int(axis.cycle["counts"][0]))
 
     def render(self, cycles: int | None) -> bool:
-        """The wall until time is up; whether it was stopped before."""
-        self._record["phase"] = Phase.RENDERING
-        pending = list(self._changes)
-        record, exchange = self._record, self._exchange
+        """The walls until time is up; whether it was stopped before."""
+        if self._stop() or self._measure_delays():
+            return True
+        for axis in self._axes:
+            # The handle may be inside the wall: its force comes up without a kick.
+            fade_in(axis.cycle, round(axis.settings.run.ramp_in_s / self._period))
+        self._enter(Phase.RENDERING)
+        pending = [(axis, list(axis.changes)) for axis in self._axes]
         while cycles is None or self.j < cycles:
             if self._stop():
                 return True
-            while pending and pending[0].j <= self.j:
-                set_wall(self._cycle, pending.pop(0).wall, self._laws)
-            exchange.cycle()
-            if record["trip"]:
-                raise _WallGivenUpError(self._trip_text())
+            for axis, changes in pending:
+                _change(axis, changes, self._period)
+            self._exchange.cycle()
+            self._check()
             if self.j % self._progress_every == 0:
                 self._progress(self.j)
         return False
 
+    def _measure_delays(self) -> bool:
+        """Find the delay of the axes that ask for it; whether it was stopped before."""
+        tests = [DelayTest(axis) for axis in self._axes if axis.measures_delay]
+        if not tests:
+            return False
+        self._enter(Phase.MEASURING)
+        for _ in range(max(test.cycles for test in tests)):
+            if self._stop():
+                return True
+            for test in tests:
+                test.excite()
+            self._exchange.cycle()
+            self._check()
+            for test in tests:
+                test.note()
+        for test in tests:
+            try:
+                axis = test.axis
+                axis.delay = test.delay()
+                set_delay(axis.cycle, axis.settings, axis.delay)
+            except ValueError as error:
+                raise _WallGivenUpError(self._say(test.axis, str(error))) from None
+        return False
+
+    def _check(self) -> None:
+        for axis in self._axes:
+            if axis.cycle["trip"][0]:
+                raise _WallGivenUpError(self._say(axis, _trip_text(axis)))
+
     def leave(self) -> bool:
-        """Zero torque and the state machine down; whether the drive confirmed it."""
-        record = self._record
-        record["phase"] = Phase.LEAVING
-        if record["trip"] == Trip.MISSED_TPDO:
+        """Zero torque and the state machines down; whether the drives confirmed it."""
+        self._enter(Phase.LEAVING)
+        if any(axis.cycle["trip"][0] == Trip.MISSED_TPDO for axis in self._axes):
             # The drive may hear though it is not heard: quick stop, whatever its state.
-            record["controlword"] = Controlword.QUICK_STOP
+            for axis in self._axes:
+                axis.cycle["controlword"] = Controlword.QUICK_STOP
             self._exchange.cycle()
         for _ in range(_LEAVE_CYCLES):
-            state = state_of(int(record["statusword"]))
-            record["controlword"] = controlword_down(state)
-            if state in _DISABLED and self._exchange.row["phase"][0] == Phase.LEAVING:
+            for axis in self._axes:
+                state = state_of(int(axis.cycle["statusword"][0]))
+                axis.cycle["controlword"] = controlword_down(state)
+            if all(_is_down(axis) for axis in self._axes):
                 return True
-            if self._silent():
+            if all(_is_down(axis) or _is_silent(axis) for axis in self._axes):
                 return False
             self._exchange.cycle()
         return False
 
     def disable_over_sdo(self) -> bool:
-        """Zero torque and no voltage without the cycle; whether the drive confirmed it."""
-        self._node.write(od.TARGET_TORQUE, 0, 0)
-        self._node.write(od.CONTROLWORD, 0, Controlword.DISABLE_VOLTAGE)
-        return state_of(self._node.read(od.STATUSWORD)) in _DISABLED
+        """Zero torque and no voltage without the cycle; whether the drives confirmed it."""
+        confirmed = []
+        failed: DriveError | None = None
+        for axis in self._axes:
+            try:
+                axis.node.write(od.TARGET_TORQUE, 0, 0)
+                axis.node.write(od.CONTROLWORD, 0, Controlword.DISABLE_VOLTAGE)
+                confirmed.append(state_of(axis.node.read(od.STATUSWORD)) in _DISABLED)
+            except DriveError as error:
+                failed = error
+        if failed is not None:
+            raise failed
+        return all(confirmed)
 
-    def _silent(self) -> bool:
-        return bool(self._record["missed_in_a_row"] >= _SILENT_CYCLES)
 
-    def _state(self) -> str:
-        statusword = int(self._record["statusword"])
-        return f"{state_of(statusword)} (statusword {statusword:#06x})"
+def _change(axis: Axis, changes: list[Change], period: float) -> None:
+    """Change wall and limits where it is time to, each change once the one before is complete."""
+    if axis.cycle["fade_left"][0]:
+        return
+    blend = round(axis.settings.run.blend_s / period)
+    if len(axis.turns) > 1 and axis.cycle["strikes"][0] >= axis.next_turn:
+        fade_over(axis.cycle, blend)
+        set_wall(axis.cycle, axis.turns[axis.next_turn % len(axis.turns)], axis.laws)
+        axis.next_turn += 1
+    if changes and changes[0].j <= axis.cycle["j"][0]:
+        fade_over(axis.cycle, blend)
+        while changes and changes[0].j <= axis.cycle["j"][0]:
+            change = changes.pop(0)
+            set_wall(axis.cycle, change.wall, axis.laws)
+            set_limits(axis.cycle, change.limits)
+            axis.turns = axis.settings.laws_in_turn(change.wall)
 
-    def _emergency(self) -> str:
-        if not self._node.emergencies:
-            return ""
-        latest = self._node.emergencies[-1]
-        return f"; EMCY {latest.code:#06x} ({latest.get_desc() or 'no description'})"
 
-    def _trip_text(self) -> str:
-        record, j = self._record, self.j - 1
-        position = float(record["counts"]) * float(record["rad_per_count"])
-        match Trip(int(record["trip"])):
-            case Trip.SPEED:
-                speed = float(record["estimator"]["v"][0])
-                what = f"speed {speed:.3g} rad/s beyond limits.speed_rad_s"
-            case Trip.POSITION:
-                what = f"position {position:.4g} rad outside limits.position_rad"
-            case Trip.MISSED_TPDO:
-                what = f"no TPDO for {int(record['missed_in_a_row'])} cycles"
-            case Trip.NOT_ENABLED:
-                what = f"the drive left OPERATION ENABLED: {self._state()}{self._emergency()}"
-            case _:
-                law = self._laws[int(record["law"])].name
-                what = f"law {law} gave a force that is not a number"
-        return f"cycle {j} ({j * float(record['period']):.3f} s): {what}"
+def _is_enabled(axis: Axis) -> bool:
+    """Whether the drive shows OPERATION ENABLED; sets the controlword that leads there."""
+    state = state_of(int(axis.cycle["statusword"][0]))
+    axis.cycle["controlword"] = controlword_up(state, int(axis.cycle["controlword"][0]))
+    return state is State.OPERATION_ENABLED
+
+
+def _is_down(axis: Axis) -> bool:
+    """Whether the drive has shown, since it is being left, that it gives no torque."""
+    state = state_of(int(axis.cycle["statusword"][0]))
+    return state in _DISABLED and bool(axis.row["phase"][0] == Phase.LEAVING)
+
+
+def _is_silent(axis: Axis) -> bool:
+    return bool(axis.cycle["missed_in_a_row"][0] >= _SILENT_CYCLES)
+
+
+def _state(axis: Axis) -> str:
+    statusword = int(axis.cycle["statusword"][0])
+    return f"{state_of(statusword)} (statusword {statusword:#06x})"
+
+
+def _emergency(axis: Axis) -> str:
+    if not axis.node.emergencies:
+        return ""
+    latest = axis.node.emergencies[-1]
+    return f"; EMCY {latest.code:#06x} ({latest.get_desc() or 'no description'})"
+
+
+def _trip_text(axis: Axis) -> str:
+    cycle, row = axis.cycle[0], axis.row[0]
+    j = int(row["j"])
+    match Trip(int(cycle["trip"])):
+        case Trip.SPEED:
+            speed = float(cycle["estimator"]["v"][0])
+            what = f"speed {speed:.3g} rad/s beyond limits.speed_rad_s"
+        case Trip.POSITION:
+            what = f"position {float(row['position_rad']):.4g} rad outside limits.position_rad"
+        case Trip.ENERGY:
+            energy = float(cycle["energy_out"])
+            what = f"the wall has put out {energy:.3g} J in this contact, beyond limits.energy_j"
+        case Trip.MISSED_TPDO:
+            what = f"no TPDO for {int(cycle['missed_in_a_row'])} cycles"
+        case Trip.NOT_ENABLED:
+            what = f"the drive left OPERATION ENABLED: {_state(axis)}{_emergency(axis)}"
+        case Trip.REPORTED:
+            what = axis.reported
+        case _:
+            law = axis.laws[int(cycle["rendered"]["law"][0])].name
+            what = f"law {law} gave a force that is not a number"
+    return f"cycle {j} ({j * float(cycle['period']):.3f} s): {what}"

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
-from canwall.config import Settings, Wall
+from canwall.config import Limits, Settings, Wall
 from canwall.drive import DriveSetup, PdoLayout, State
 from canwall.drive import objects as od
+from canwall.metrics import STRIKE_GAP_S
 from canwall.record import Phase
 from canwall.units import to_per_mille
 from canwall.walls import (
@@ -50,6 +51,9 @@ class Trip(IntEnum):
     MISSED_TPDO = 3
     NOT_ENABLED = 4
     NOT_A_NUMBER = 5
+    ENERGY = 6
+    REPORTED = 7
+    """Something that came over the bus beside the cycle: EMCY, heartbeat, error frame."""
 
 
 # The enums' values as plain numbers for the compiled code.
@@ -59,9 +63,31 @@ _POSITION = int(Trip.POSITION)
 _MISSED = int(Trip.MISSED_TPDO)
 _NOT_ENABLED = int(Trip.NOT_ENABLED)
 _NAN = int(Trip.NOT_A_NUMBER)
+_ENERGY = int(Trip.ENERGY)
+_MEASURING = int(Phase.MEASURING)
 _ENABLED_MASK, _ENABLED_VALUE = State.OPERATION_ENABLED.value
 
 _FIELD = [("shift", "i8"), ("bits", "i8")]
+
+#: No law: a wall that is not there and gives no force.
+_NO_LAW = -1
+
+#: A wall on the drive's axis, and the law that renders it.
+RENDERED = np.dtype(
+    [
+        ("law", "i8"),  # index into the laws of the cycle
+        ("position", "f8"),
+        ("estimated_velocity", "?"),
+        ("divider", "i8"),  # the law is asked every so many cycles
+        ("wall", WALL, (1,)),
+        # State: cycles since the law was asked, its force, its sample, the time since then.
+        ("waited", "i8"),
+        ("force", "f8"),
+        ("y_before", "f8"),
+        ("elapsed", "f8"),
+    ],
+    align=True,
+)
 
 #: Settings, state and results of one wall on one drive.
 CYCLE = np.dtype(
@@ -77,33 +103,42 @@ CYCLE = np.dtype(
         ("rad_per_count", "f8"),
         ("nm_per_mille", "f8"),
         ("torque_limit", "f8"),
+        ("torque_rate", "f8"),
         ("speed_limit", "f8"),
         ("position_low", "f8"),
         ("position_high", "f8"),
+        ("energy_limit", "f8"),
         ("hold_cycles", "i8"),
         ("ramp_cycles", "i8"),
-        # The wall.
+        ("strike_gap", "i8"),
+        # The wall, and the one that it takes over from, cycle by cycle.
         ("orientation", "f8"),
-        ("wall_position", "f8"),
-        ("estimated_velocity", "?"),
-        ("law", "i8"),
         ("laws", "u8", (MAX_LAWS,)),
-        ("wall", WALL, (1,)),
+        ("rendered", RENDERED, (1,)),
+        ("faded", RENDERED, (1,)),
+        ("fade_cycles", "i8"),
+        ("fade_left", "i8"),
         ("estimator", ESTIMATOR, (1,)),
         # What the loop asks for.
         ("phase", "i8"),
         ("controlword", "i8"),
+        ("test_per_mille", "i8"),
         # State.
         ("j", "i8"),
         ("counts", "i8"),
         ("statusword", "i8"),
         ("torque_actual", "i8"),
-        ("y_before", "f8"),
         ("torque_per_mille", "i8"),
         ("missed_in_a_row", "i8"),
+        ("oriented", "f8"),
+        ("force_applied", "f8"),
+        ("energy_out", "f8"),
+        ("touched", "?"),
+        ("outside", "i8"),
         # Results.
         ("trip", "i8"),
         ("missed_tpdo", "i8"),
+        ("strikes", "i8"),
     ],
     align=True,
 )
@@ -124,34 +159,40 @@ def make_cycle(settings: Settings, setup: DriveSetup, laws: Sequence[Law]) -> ND
         ("out_torque", setup.rpdo, od.TARGET_TORQUE),
     ):
         _set_field(cycle, name, layout, index)
-    units, mechanics, limits = setup.units, settings.mechanics, settings.limits
     period = settings.bus.cycle_s
     cycle["period"] = period
-    cycle["rad_per_count"] = units.rad_per_count
-    cycle["nm_per_mille"] = units.nm_per_mille
-    cycle["torque_limit"] = limits.torque_nm
-    cycle["speed_limit"] = limits.speed_rad_s
-    cycle["position_low"], cycle["position_high"] = limits.position_rad
-    cycle["hold_cycles"] = limits.hold_cycles
-    cycle["ramp_cycles"] = limits.ramp_cycles
+    cycle["rad_per_count"] = setup.units.rad_per_count
+    cycle["nm_per_mille"] = setup.units.nm_per_mille
+    cycle["strike_gap"] = round(STRIKE_GAP_S / period)
     for i, law in enumerate(laws):
         cycle["laws"][0, i] = law.address
-    mass, viscous = mechanics.inertia_kg_m2, mechanics.viscous_nm_s_per_rad
-    spring = mechanics.spring_nm_per_rad
-    set_plant(cycle["wall"][0], mass, viscous, spring, period)
-    set_estimator(
-        cycle["estimator"][0],
-        mass,
-        viscous,
-        spring,
-        mechanics.coulomb_nm,
-        period,
-        count=units.rad_per_count,
-        force_walk=settings.estimator.force_walk_nm_per_sqrt_s,
-        delay=SYNCHRONOUS_DELAY,
-    )
+    delay = settings.estimator.delay_cycles
+    set_delay(cycle, settings, SYNCHRONOUS_DELAY if delay is None else delay)
+    set_limits(cycle, settings.limits)
+    set_plant(cycle["rendered"][0]["wall"][0], *_model(settings), period)
+    cycle["rendered"]["law"] = _NO_LAW
     set_wall(cycle, settings.wall, laws)
     return cycle
+
+
+def _model(settings: Settings) -> tuple[float, float, float]:
+    """Mass, viscous damping and spring of `[mechanics]`."""
+    mechanics = settings.mechanics
+    return mechanics.inertia_kg_m2, mechanics.viscous_nm_s_per_rad, mechanics.spring_nm_per_rad
+
+
+def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None:
+    """Write the estimator for a delay of `delay` periods; it starts anew. Raises ValueError."""
+    set_estimator(
+        cycle["estimator"][0],
+        *_model(settings),
+        settings.mechanics.coulomb_nm,
+        settings.bus.cycle_s,
+        count=float(cycle["rad_per_count"][0]),
+        force_walk=settings.estimator.force_walk_nm_per_sqrt_s,
+        delay=delay,
+    )
+    reset_estimator(cycle["estimator"][0], float(cycle["oriented"][0]))
 
 
 def _set_field(cycle: NDArray[np.void], name: str, layout: PdoLayout, index: int) -> None:
@@ -160,32 +201,61 @@ def _set_field(cycle: NDArray[np.void], name: str, layout: PdoLayout, index: int
         cycle[name]["shift"], cycle[name]["bits"] = field.shift, field.bits
 
 
+def set_limits(cycle: NDArray[np.void], limits: Limits) -> None:
+    """Change the limits between two cycles."""
+    cycle["torque_limit"] = limits.torque_nm
+    cycle["torque_rate"] = limits.torque_rate_nm_per_s or math.inf
+    cycle["speed_limit"] = limits.speed_rad_s
+    cycle["position_low"], cycle["position_high"] = limits.position_rad
+    cycle["energy_limit"] = limits.energy_j or math.inf
+    cycle["hold_cycles"] = limits.hold_cycles
+    cycle["ramp_cycles"] = limits.ramp_cycles
+
+
 def set_wall(cycle: NDArray[np.void], wall: Wall, laws: Sequence[Law]) -> None:
     """Change the wall between two cycles; its law is one of `laws`. Raises UnknownLawError."""
-    cycle["orientation"] = 1.0 if wall.side == "below" else -1.0
-    cycle["wall_position"] = wall.position_rad
-    cycle["estimated_velocity"] = wall.velocity == "estimated"
     law = find_law(wall.law, wall.deadbeat)
-    rendered = cycle["wall"][0]
-    set_referent(
-        rendered,
-        wall.stiffness_nm_per_rad,
-        wall.damping_nm_s_per_rad,
-        law.option_values(wall.options),
-    )
-    rendered["tension"] = TENSION[wall.tension]
-    rendered["passivity_damping"] = wall.passivity_nm_s_per_rad
+    options = law.option_values(wall.options)
     index = [known.name for known in laws].index(law.name)
-    if index != cycle["law"][0]:
-        cycle["law"] = index
-        forget(rendered)
+    cycle["orientation"] = 1.0 if wall.side == "below" else -1.0
+    rendered = cycle["rendered"][0]
+    known = rendered["wall"][0]
+    rendered["position"] = wall.position_rad
+    rendered["estimated_velocity"] = wall.velocity == "estimated"
+    if wall.divider != rendered["divider"]:
+        # The law's torques are held for as long as it is not asked again.
+        rendered["divider"] = rendered["waited"] = wall.divider
+        mass, viscous, spring = (known[name].item() for name in ("mass", "viscous", "spring"))
+        set_plant(known, mass, viscous, spring, cycle["period"].item() * wall.divider)
+    set_referent(known, wall.stiffness_nm_per_rad, wall.damping_nm_s_per_rad, options)
+    known["tension"] = TENSION[wall.tension]
+    known["passivity_damping"] = wall.passivity_nm_s_per_rad
+    if index != rendered["law"]:
+        rendered["law"] = index
+        forget(known)
+
+
+def fade_over(cycle: NDArray[np.void], cycles: int) -> None:
+    """Let the wall as it is now give way to what is set next, without a bump, within `cycles`.
+
+    To be called before `set_wall`. Force and wall change places linearly; where neither gives a
+    force there is nothing to fade.
+    """
+    cycle["faded"] = cycle["rendered"]
+    cycle["fade_cycles"] = cycle["fade_left"] = cycles
+
+
+def fade_in(cycle: NDArray[np.void], cycles: int) -> None:
+    """Let the wall come up out of nothing within `cycles`: the handle may be inside it."""
+    fade_over(cycle, cycles)
+    cycle["faded"]["law"] = _NO_LAW
 
 
 def start_at(cycle: NDArray[np.void], counts: int) -> None:
     """Begin at rest at a position: the first that the drive reports."""
     oriented = cycle["orientation"][0] * counts * cycle["rad_per_count"][0]
     reset_estimator(cycle["estimator"][0], oriented)
-    cycle["y_before"] = oriented
+    cycle["oriented"] = cycle["rendered"]["y_before"] = oriented
 
 
 @compiled
@@ -217,18 +287,79 @@ def read_inputs(cycles: NDArray[np.void], data: int) -> None:
 
 
 @compiled
-def _wanted_force(cycle: Record, received: bool) -> float:
-    """Force out of the wall from the instant of actuation on; sets the trip that ends it."""
-    if not received:
-        # Hold the torque, then let go of it along a ramp, then give up.
-        held = cycle.orientation * cycle.torque_per_mille * cycle.nm_per_mille
-        overdue = cycle.missed_in_a_row - cycle.hold_cycles
-        if overdue <= 0:
-            return held
-        if overdue >= cycle.ramp_cycles:
-            cycle.trip = _MISSED
-            return 0.0
-        return held * (cycle.ramp_cycles - overdue) / (cycle.ramp_cycles - overdue + 1.0)
+def _look(cycle: Record, rendered: Record, due: bool) -> None:
+    """Show a wall what there is to be seen of the handle, relative to itself.
+
+    The estimator works on the drive's axis, turned towards the wall: it does not notice when the
+    wall is moved. `due` says that a new sample is there and the law will be asked.
+    """
+    wall, estimator = rendered.wall[0], cycle.estimator[0]
+    origin = cycle.orientation * rendered.position
+    wall.y_sample = cycle.oriented - origin
+    rendered.elapsed += cycle.period
+    if due:
+        wall.v_sample = (cycle.oriented - rendered.y_before) / rendered.elapsed
+        rendered.y_before = cycle.oriented
+        rendered.elapsed = 0.0
+    if rendered.estimated_velocity:
+        wall.v_sample = estimator.v
+    y, wall.v = actuation_state(estimator)
+    wall.y = y - origin
+    wall.d = estimator.d - wall.spring * origin
+
+
+@compiled
+def _is_due(rendered: Record, received: bool) -> bool:
+    """Whether the law is asked in this cycle: every so many, and not without a sample."""
+    rendered.waited += 1
+    if not received or rendered.waited < rendered.divider:
+        return False
+    rendered.waited = 0
+    return True
+
+
+@compiled
+def _force_of(cycle: Record, rendered: Record, due: bool) -> float:
+    """Force of a wall: what its law says now, or said when it was last asked."""
+    if rendered.law < 0:
+        return 0.0
+    if due:
+        rendered.force = wall_force(cycle.laws[rendered.law], rendered.wall[0])
+    return rendered.force
+
+
+@compiled
+def _faded_force(cycle: Record, force: float, received: bool) -> float:
+    """The wall's force on its way from the wall before."""
+    faded = cycle.faded[0]
+    due = _is_due(faded, received)
+    _look(cycle, faded, due)
+    before = _force_of(cycle, faded, due)
+    share = cycle.fade_left / (cycle.fade_cycles + 1.0)
+    cycle.fade_left -= 1
+    if force == 0.0 and before == 0.0:
+        cycle.fade_left = 0
+    return force + share * (before - force)
+
+
+@compiled
+def _held_force(cycle: Record) -> float:
+    """Without a TPDO: hold the torque, then let go of it along a ramp, then give up."""
+    held = cycle.orientation * cycle.torque_per_mille * cycle.nm_per_mille
+    overdue = cycle.missed_in_a_row - cycle.hold_cycles
+    if overdue <= 0:
+        return held
+    if overdue >= cycle.ramp_cycles:
+        cycle.trip = _MISSED
+        return 0.0
+    return held * (cycle.ramp_cycles - overdue) / (cycle.ramp_cycles - overdue + 1.0)
+
+
+@compiled
+def _watch(cycle: Record) -> None:
+    """Set the trip of a limit that is passed; one that is set stays."""
+    if cycle.trip:
+        return
     position = cycle.counts * cycle.rad_per_count
     if not cycle.position_low <= position <= cycle.position_high:
         cycle.trip = _POSITION
@@ -236,13 +367,57 @@ def _wanted_force(cycle: Record, received: bool) -> float:
         cycle.trip = _SPEED
     elif cycle.statusword & _ENABLED_MASK != _ENABLED_VALUE:
         cycle.trip = _NOT_ENABLED
-    if cycle.trip:
-        return 0.0
-    force = wall_force(cycle.laws[cycle.law], cycle.wall[0])
+    elif cycle.energy_out > cycle.energy_limit:
+        cycle.trip = _ENERGY
+
+
+@compiled
+def _wanted_force(cycle: Record, received: bool, due: bool) -> float:
+    """Force out of the wall from the instant of actuation on; sets the trip that ends it."""
+    if received:
+        _watch(cycle)
+        if cycle.trip:
+            return 0.0
+    elif not cycle.trip:
+        return _held_force(cycle)
+    if cycle.phase == _MEASURING:
+        return cycle.orientation * cycle.test_per_mille * cycle.nm_per_mille
+    force = _force_of(cycle, cycle.rendered[0], due)
+    if cycle.fade_left > 0:
+        force = _faded_force(cycle, force, received)
     if not math.isfinite(force):
         cycle.trip = _NAN
         return 0.0
-    return force
+    # A torque that may not change faster than this is held back, on either way.
+    before = cycle.orientation * cycle.torque_per_mille * cycle.nm_per_mille
+    most = cycle.torque_rate * cycle.period
+    return min(max(force, before - most), before + most)
+
+
+@compiled
+def _keep_books(cycle: Record, received: bool) -> None:
+    """Energy that the wall has put out in this contact, and the strikes that are over.
+
+    W = Σ f_applied[j]·(y[j+1] − y[j]) (theory, section 5), from the beginning of a contact on.
+    """
+    oriented = cycle.orientation * cycle.counts * cycle.rad_per_count
+    if received:
+        cycle.energy_out += cycle.force_applied * (oriented - cycle.oriented)
+    cycle.oriented = oriented
+    cycle.force_applied = cycle.orientation * cycle.torque_actual * cycle.nm_per_mille
+    inside = oriented < cycle.orientation * cycle.rendered[0].position
+    if not inside and cycle.force_applied == 0.0:
+        cycle.energy_out = 0.0
+    if cycle.phase != _RENDERING:
+        return
+    if inside:
+        cycle.touched = True
+        cycle.outside = 0
+    elif cycle.touched:
+        cycle.outside += 1
+        if cycle.outside > cycle.strike_gap:
+            cycle.touched = False
+            cycle.strikes += 1
 
 
 @compiled
@@ -254,41 +429,32 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     """
     cycle: Record = cycles[0]
     row: Record = rows[0]
-    wall = cycle.wall[0]
+    rendered = cycle.rendered[0]
+    wall = rendered.wall[0]
     estimator = cycle.estimator[0]
-    elapsed = cycle.period
     if received:
         read_inputs(cycles, data)
-        elapsed *= 1 + cycle.missed_in_a_row
         cycle.missed_in_a_row = 0
     else:
         cycle.torque_actual = cycle.torque_per_mille
         cycle.missed_in_a_row += 1
         cycle.missed_tpdo += 1
-
-    # The estimator works on the drive's axis, turned towards the wall: it does not notice when
-    # the wall is moved. What the laws see is relative to the wall.
-    oriented = cycle.orientation * cycle.counts * cycle.rad_per_count
-    origin = cycle.orientation * cycle.wall_position
+    _keep_books(cycle, received)
     if received:
-        observe(estimator, oriented)
-    wall.y_sample = oriented - origin
-    wall.v_sample = (oriented - cycle.y_before) / elapsed
-    if cycle.estimated_velocity:
-        wall.v_sample = estimator.v
-    cycle.y_before = oriented
-    y, wall.v = actuation_state(estimator)
-    wall.y = y - origin
-    wall.d = estimator.d - wall.spring * origin
+        observe(estimator, cycle.oriented)
+    active = cycle.phase == _RENDERING or cycle.phase == _MEASURING
+    due = _is_due(rendered, received) or (received and not active)
+    _look(cycle, rendered, due)
 
     force = 0.0
-    if cycle.phase == _RENDERING:
-        force = _wanted_force(cycle, received)
-    torque_applied = cycle.torque_actual * cycle.nm_per_mille
+    if active:
+        force = _wanted_force(cycle, received, due)
     per_mille = to_per_mille(cycle.orientation * force, cycle.nm_per_mille, cycle.torque_limit)
     torque = per_mille * cycle.nm_per_mille
     commit(estimator, cycle.orientation * torque)
-    note_force(wall, cycle.orientation * torque)
+    if due:
+        note_force(wall, cycle.orientation * torque)
+        note_force(cycle.faded[0].wall[0], cycle.orientation * torque)
     cycle.torque_per_mille = per_mille
 
     row.j = cycle.j
@@ -306,12 +472,12 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     row.force = force
     row.torque_cmd_per_mille = per_mille
     row.torque_cmd = torque
-    row.torque_applied = torque_applied
-    row.force_applied = cycle.orientation * torque_applied
-    row.law = cycle.law
+    row.torque_applied = cycle.torque_actual * cycle.nm_per_mille
+    row.force_applied = cycle.force_applied
+    row.law = rendered.law
     row.stiffness = wall.stiffness
     row.damping = wall.damping
-    row.wall_position_rad = cycle.wall_position
+    row.wall_position_rad = rendered.position
     cycle.j += 1
     return _placed(cycle.controlword, cycle.out_controlword[0]) | _placed(
         per_mille, cycle.out_torque[0]

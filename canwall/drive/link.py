@@ -9,7 +9,7 @@ import contextlib
 import logging
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Container
 
 import can
 import canopen
@@ -41,6 +41,7 @@ class Link:
         self._bus = bus
         self._idle = idle
         self.log: FrameLog | None = None
+        self.on_error_frame: Callable[[can.Message], None] | None = None
         self.network = _Network(self)
 
     def send(self, message: can.Message) -> None:
@@ -68,15 +69,15 @@ class Link:
                 return message
             self._idle()
 
-    def wait_for(self, can_id: int, timeout_s: float) -> can.Message | None:
-        """The next data frame with this identifier; what comes before it goes to the network."""
+    def wait_for(self, can_ids: Container[int], timeout_s: float) -> can.Message | None:
+        """The next data frame with one of these identifiers; others go to the network."""
         deadline = time.monotonic() + timeout_s
         remaining = timeout_s
         while True:
             message = self.receive(remaining)
             if message is None:
                 return None
-            if message.arbitration_id == can_id and not (
+            if message.arbitration_id in can_ids and not (
                 message.is_remote_frame or message.is_error_frame
             ):
                 return message
@@ -85,7 +86,11 @@ class Link:
 
     def dispatch(self, message: can.Message) -> None:
         """Hand a frame to canopen (SDO answers, heartbeats, EMCY); malformed ones are ignored."""
-        if message.is_remote_frame or message.is_error_frame:
+        if message.is_error_frame:
+            if self.on_error_frame is not None:
+                self.on_error_frame(message)
+            return
+        if message.is_remote_frame:
             return
         # Somebody's heartbeat without data, or EMCY too short, is not to end the cycle.
         with contextlib.suppress(struct.error):

@@ -1,6 +1,7 @@
 """Indices of the objects that the master uses, under their names in CiA 301 and CiA 402."""
 
 SYNC_COB_ID = 0x1005
+SYNC_COUNTER_OVERFLOW = 0x1019
 RPDO_COMMUNICATION = 0x1400
 RPDO_MAPPING = 0x1600
 TPDO_COMMUNICATION = 0x1800

@@ -33,6 +33,8 @@ class DriveSetup:
     sync_cob_id: int
     tpdo: PdoLayout
     rpdo: PdoLayout
+    #: 0x1019: from 1 to this counts the SYNC that the drive wants; 0: it carries nothing.
+    sync_counter_overflow: int = 0
 
 
 def set_up(node: DriveNode, settings: DriveSettings) -> DriveSetup:
@@ -52,8 +54,9 @@ def set_up(node: DriveNode, settings: DriveSettings) -> DriveSetup:
     tpdo = configure_tpdo(node, 1, measured)
     rpdo = configure_rpdo(node, 1, [od.CONTROLWORD, od.TARGET_TORQUE])
     sync = node.read(od.SYNC_COB_ID) & 0x7FF if node.has(od.SYNC_COB_ID) else 0x80
+    overflow = node.read(od.SYNC_COUNTER_OVERFLOW) if node.has(od.SYNC_COUNTER_OVERFLOW) else 0
     node.command("OPERATIONAL")
-    return DriveSetup(units, sync, tpdo, rpdo)
+    return DriveSetup(units, sync, tpdo, rpdo, overflow)
 
 
 def read_units(node: DriveNode, settings: DriveSettings) -> DriveUnits:

@@ -1,22 +1,37 @@
 """A run's folder: its files by name, and reading them back."""
 
+import contextlib
 import json
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 
 from canwall.config import ConfigError
 from canwall.record.ring import ROW
 
+#: Cycles that are kept of the time before a trip.
+_TRIP_CYCLES = 200
+
+
+def stream_of(signals: Path) -> Path:
+    """Where the rows are while the run goes on: a stream that can be read without its end."""
+    return signals.with_suffix(".arrows")
+
 
 def read_signals(path: Path) -> pa.Table:
-    """signals.parquet as a table. Raises ConfigError where it is missing or not readable."""
+    """signals.parquet as a table; of a run that was cut off, what its stream has.
+
+    Raises ConfigError where it is missing or not readable.
+    """
     try:
-        table = pq.read_table(path)
+        stream = stream_of(path)
+        table = _read_stream(stream) if stream.exists() else pq.read_table(path)
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; give the folder of a run") from None
     except (OSError, pa.ArrowInvalid) as error:
@@ -26,6 +41,15 @@ def read_signals(path: Path) -> pa.Table:
     if missing:
         raise ConfigError(f"{path}: not a record of a run: lacks column {', '.join(missing)}")
     return table
+
+
+def _read_stream(path: Path) -> pa.Table:
+    """The batches of a stream up to the one that was not written to its end."""
+    with path.open("rb") as file, pa.ipc.open_stream(file) as stream:
+        batches = []
+        with contextlib.suppress(OSError, pa.ArrowInvalid):
+            batches.extend(stream)
+        return pa.Table.from_batches(batches, stream.schema)
 
 
 @dataclass(frozen=True)
@@ -40,10 +64,9 @@ class RunFolder:
 
         Raises ConfigError where the folder cannot be made or holds a run already.
         """
-        if path is None:
-            path = Path("runs") / datetime.now().strftime("%Y-%m-%d_%H-%M-%S_%f")
+        path = path or cls.default_path()
         folder = cls(path)
-        if folder.signals.exists():
+        if folder.signals.exists() or stream_of(folder.signals).exists():
             raise ConfigError(f"{path}: holds a run already; choose another --output")
         try:
             path.mkdir(parents=True, exist_ok=True)
@@ -55,6 +78,11 @@ class RunFolder:
                 f"{path}: cannot be written: {error.strerror}; choose another --output"
             ) from None
         return folder
+
+    @staticmethod
+    def default_path() -> Path:
+        """`runs/<date and time>` under the current directory."""
+        return Path("runs") / datetime.now().strftime("%Y-%m-%d_%H-%M-%S_%f")
 
     @property
     def signals(self) -> Path:
@@ -75,6 +103,18 @@ class RunFolder:
     def picture(self) -> Path:
         """The run at a glance."""
         return self.path / "run.png"
+
+    @property
+    def trip(self) -> Path:
+        """The last cycles before a trip, every column, for a spreadsheet."""
+        return self.path / "trip.csv"
+
+    def write_trip(self, signals: pa.Table, cycle: int) -> None:
+        """Keep the cycles up to the one that tripped. Shows them in the order of j."""
+        end = int(np.searchsorted(signals["j"].to_numpy(), cycle, side="right"))
+        pa_csv.write_csv(
+            signals.slice(max(0, end - _TRIP_CYCLES), min(end, _TRIP_CYCLES)), self.trip
+        )
 
     def read_summary(self) -> dict[str, Any]:
         """summary.json. Raises ConfigError where it is missing or not JSON."""

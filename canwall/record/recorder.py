@@ -23,11 +23,17 @@ class Recorder:
     completed all the same.
     """
 
-    def __init__(self, folder: Path, bus_log: str, channel: str, laws: list[str]) -> None:
+    def __init__(self, folder: Path, bus_log: str | None, channel: str, laws: list[str]) -> None:
         """Start recording into an existing folder. Raises RecordError."""
         self.folder = folder
         self.ring = Ring.create()
-        arguments = [str(self.ring.descriptor), str(folder), bus_log, channel, json.dumps(laws)]
+        arguments = [
+            str(self.ring.descriptor),
+            str(folder),
+            bus_log or "",
+            channel,
+            json.dumps(laws),
+        ]
         try:
             self._writer = subprocess.Popen(
                 [sys.executable, "-m", "canwall.record.writer", *arguments],

@@ -21,6 +21,7 @@ class Phase(IntEnum):
     ENABLING = 0
     RENDERING = 1
     LEAVING = 2
+    MEASURING = 3
 
 
 #: One cycle, as `signals.parquet` has it. Positions and torques with a sign of the drive's axis

@@ -10,11 +10,12 @@ from canwall.config import Hand, Mechanics, Settings, Simulation, Wall
 from canwall.record import Ring
 from canwall.run import (
     drive_dictionary,
+    make_axis,
+    make_exchange,
     on_the_bus,
     referent_positions,
     render,
     run_laws,
-    set_up_bench,
 )
 from canwall.units import DriveUnits
 
@@ -138,12 +139,12 @@ def strike_over_bus(settings: Settings) -> Verdict:
 
     try:
         with on_the_bus(settings) as link:
-            bench = set_up_bench(link, settings, drive_dictionary(settings), laws, ring)
-            outcome = render(bench, settings, laws, lambda: False, collect)
+            axis = make_axis(link, settings, drive_dictionary(settings), laws, ring)
+            outcome = render(make_exchange(link, [axis]), lambda: False, collect)
         collect(0.0)
     finally:
         ring.close()
-    return judge(np.concatenate(pieces), settings, bench.setup.units, tuple(outcome.trips))
+    return judge(np.concatenate(pieces), settings, axis.setup.units, tuple(outcome.trips))
 
 
 def judge(

@@ -94,7 +94,14 @@ def effort(recorded: Recorded, wall: Wall) -> Array:
     seen = np.stack([y, v, *(recorded.column(c) for c in ("y_est", "v_est", "d_est"))])
     held = np.zeros(len(y))
     address = find_law(wall.law, wall.deadbeat).address
-    _hold(cycle["wall"][0], address, seen, units.nm_per_mille, settings.limits.torque_nm, held)
+    _hold(
+        cycle["rendered"][0]["wall"][0],
+        address,
+        seen,
+        units.nm_per_mille,
+        settings.limits.torque_nm,
+        held,
+    )
     return held
 
 
@@ -179,7 +186,7 @@ def _strikes(recorded: Recorded) -> Sheet:
 
 
 def _efforts(recorded: Recorded) -> Sheet:
-    (_, displayed), (_, other) = recorded.settings.walls[:2]
+    displayed, other = (stage.wall for stage in recorded.settings.stages[:2])
     box = close_up(recorded)
     stiffness = displayed.stiffness_nm_per_rad
     t, y = recorded.column("t_s")[box], recorded.column("y")[box] * 1e3

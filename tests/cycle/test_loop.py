@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rig import RPDO1, SDO_REQUEST, SYNC, TPDO1, Loop, Rig, RigFactory, settings_with
 
 from canwall.config import Settings
-from canwall.cycle import Change, Outcome, run_loop
+from canwall.cycle import Change, Outcome
 from canwall.cycle import exchange as exchange_module
 from canwall.record import Phase
 
@@ -120,13 +120,13 @@ def test_stopped_while_enabling(make_rig: RigFactory, j: int) -> None:
 
 
 def test_changes_take_effect_at_their_cycle(make_rig: RigFactory) -> None:
-    rig = make_rig(settings_with())  # its schedule has both laws
+    rig = make_rig(settings_with({"run.blend_s": 0.0}))  # its schedule has both laws
     loop = Loop(rig)
-    wall = rig.settings.wall
+    wall, limits = rig.settings.wall, rig.settings.limits
     changes = [
-        Change(300, wall.model_copy(update={"law": "half_sample"})),
-        Change(310, wall.model_copy(update={"stiffness_nm_per_rad": 20.0})),
-        Change(310, wall.model_copy(update={"position_rad": -0.01})),
+        Change(300, wall.model_copy(update={"law": "half_sample"}), limits),
+        Change(310, wall.model_copy(update={"stiffness_nm_per_rad": 20.0}), limits),
+        Change(310, wall.model_copy(update={"position_rad": -0.01}), limits),
     ]
     loop.run(400, changes=changes)
     rows = loop.rows()
@@ -139,29 +139,27 @@ def test_changes_take_effect_at_their_cycle(make_rig: RigFactory) -> None:
 def test_progress_is_told_now_and_then(make_rig: RigFactory) -> None:
     loop = Loop(make_rig(pressing()))
     told: list[int] = []
-    run_loop(
-        loop.exchange,
-        loop.record,
-        loop.rig.node,
-        loop.laws,
-        [],
-        450,
-        lambda: False,
-        told.append,
-    )
+    loop.run(450, progress=told.append)
     assert told == [100, 200, 300, 400]
 
 
 # Before enabling
 
 
-def test_start_inside_the_wall_is_refused(make_rig: RigFactory) -> None:
-    loop = Loop(make_rig(pressing({"wall.position_rad": 0.25})))
-    outcome = loop.run(500)
-    (trip,) = outcome.trips
-    assert trip == "the handle is 0.15 rad inside the wall: move it out, or wall.position_rad"
-    assert outcome.disabled
-    assert_never_enabled(loop)
+def test_start_inside_the_wall_comes_without_a_kick(make_rig: RigFactory) -> None:
+    inside = {"wall.position_rad": 0.11, "run.ramp_in_s": 0.1}
+    loop = Loop(make_rig(pressing(inside)))  # the handle rests at 0.1 rad
+    outcome = loop.run(150)
+    assert outcome.trips == []
+    rows = loop.rows()
+    rows = rows[rows["phase"] == Phase.RENDERING]
+    assert rows["y"][0] == pytest.approx(-0.01, abs=1e-4)
+    full = 50.0 * 0.01
+    assert np.diff(rows["force"][:100], prepend=0.0).max() < 0.02 * full
+    # The wall is stiffer than the finger by far: it moves the handle to its surface.
+    assert rows["y"][-1] > -0.001
+    # The wall holds the finger's spring, which is about 0.1 rad: 3.2 N·m/rad times 0.0093 rad.
+    assert rows["force"][-1] == pytest.approx(0.03, abs=0.01)
 
 
 def test_no_tpdo_at_all(make_rig: RigFactory) -> None:
@@ -246,9 +244,71 @@ def test_drive_in_fault_is_named_with_its_emergency(make_rig: RigFactory) -> Non
     loop = Loop(make_rig(pressing()))
     loop.rig.node.write(0x1016, 1, 0x7F0001)  # misses the heartbeat of node 127 after 1 ms
     trip = trip_of(loop, lambda j: loop.rig.inject(0x77F, b"\x05"))
-    assert "the drive left OPERATION ENABLED: FAULT" in trip
-    assert "EMCY 0x8130" in trip
+    assert trip.endswith("EMCY 0x8130 (Monitoring), register 0x11")
     assert loop.rig.rpdos()[-1][1] == 0
+
+
+def test_emergency_that_is_only_to_be_noted(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing({"limits.emergency": "note"})))
+
+    def warn(j: int) -> bool:
+        if j == PRESSING:
+            loop.rig.inject(0x085, b"\x10\x42\x08\0\0\0\0\0")
+        return False
+
+    outcome = loop.run(PRESSING + 20, warn)
+    assert outcome.trips == []
+    assert loop.watch.notes == ["node 5: cycle 500: EMCY 0x4210 (Temperature), register 0x08"]
+
+
+def test_torque_is_zero_in_the_cycle_of_the_emergency(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing()))
+    trip_of(loop, lambda j: loop.rig.inject(0x085, b"\x10\x23\x03\0\0\0\0\0"))
+    assert loop.rig.rpdos()[PRESSING][1] == 0
+
+
+@pytest.mark.parametrize(
+    ("state", "text"),
+    [
+        (0x00, "the drive restarted"),
+        (0x04, "the drive is in NMT STOPPED"),
+        (0xFF, "the drive is in NMT PRE-OPERATIONAL"),
+    ],
+)
+def test_heartbeat_that_tells_of_another_state(make_rig: RigFactory, state: int, text: str) -> None:
+    loop = Loop(make_rig(pressing()))
+    trip = trip_of(loop, lambda j: loop.rig.inject(0x705, bytes([state])))
+    assert trip == f"cycle 500 (0.500 s): {text}"
+
+
+def test_heartbeat_of_a_drive_that_is_well_says_nothing(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing()))
+    loop.rig.inject(0x705, b"\x05")
+    assert loop.run(300).trips == []
+
+
+def test_second_producer_of_the_sync(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing()))
+    trip = trip_of(loop, lambda j: loop.rig.inject(SYNC, b""))
+    assert trip == "cycle 500 (0.500 s): somebody else sends SYNC (0x080) as well"
+
+
+def test_error_frames_are_counted_and_bus_off_ends_the_run(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing()))
+
+    def report(kind: int) -> None:
+        loop.rig.drive_bus.send(
+            can.Message(arbitration_id=kind, is_error_frame=True, dlc=8, data=bytes(8))
+        )
+
+    def happens(j: int) -> bool:
+        if j in (300, 400, PRESSING):
+            report(0x40 if j == PRESSING else 0x04)  # bus-off, controller problems
+        return False
+
+    outcome = loop.run(None, happens)
+    assert outcome.trips == ["cycle 500 (0.500 s): the adapter is bus-off"]
+    assert loop.watch.error_frames == 3
 
 
 def test_drive_that_falls_silent(make_rig: RigFactory) -> None:
@@ -276,6 +336,24 @@ def test_speed_and_position_limits_end_the_run(make_rig: RigFactory) -> None:
         (trip,) = outcome.trips
         assert text in trip
         assert_ended_in_order(loop, outcome, loop.rows())
+
+
+def test_energy_put_out_in_one_contact_ends_the_run(make_rig: RigFactory) -> None:
+    active = {"wall.law": "standard", "limits.energy_j": 1e-3}
+    loop = Loop(make_rig(settings_with(active)))
+    outcome = loop.run(1000)
+    (trip,) = outcome.trips
+    assert "J in this contact, beyond limits.energy_j" in trip
+    rows = loop.rows()
+    assert_ended_in_order(loop, outcome, rows)
+    # The same by hand: work of the applied force since the contact began.
+    end = int(np.flatnonzero(rows["j"] == outcome.trip_cycle)[0])
+    force, y = rows["force_applied"], rows["y"]
+    begin = end - int(np.argmax((y[end::-1] >= 0.0) & (force[end::-1] == 0.0)))
+    work = float(np.sum(force[begin:end] * np.diff(y[begin : end + 1])))
+    assert work > 1e-3
+    assert work - force[end - 1] * (y[end] - y[end - 1]) <= 1e-3
+    assert f"{work:.3g} J" in trip
 
 
 # A bus that fails

@@ -325,13 +325,13 @@ def test_wall_is_changed_between_two_cycles() -> None:
 def test_another_law_starts_without_memories() -> None:
     wall = Wall()
     assert [law.name for law in wall.laws] == ["standard", "half_sample"]
-    wall.cycle["wall"]["memory"] = 7.0
+    wall.cycle["rendered"]["wall"]["memory"] = 7.0
     set_wall(wall.cycle, wall.settings.wall, wall.laws)
-    assert wall.cycle["wall"]["memory"][0, 0, 0] == 7.0
+    assert wall.cycle["rendered"]["wall"]["memory"].item(0) == 7.0
     other = wall.settings.wall.model_copy(update={"law": "half_sample"})
     set_wall(wall.cycle, other, wall.laws)
-    assert wall.cycle["law"][0] == 1
-    assert not wall.cycle["wall"]["memory"].any()
+    assert wall.cycle["rendered"]["law"][0] == 1
+    assert not wall.cycle["rendered"]["wall"]["memory"].any()
 
 
 def test_law_that_nobody_knows() -> None:

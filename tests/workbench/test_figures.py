@@ -240,7 +240,7 @@ def test_effort_not_displayed_is_the_laws_own() -> None:
     settings = recorded.settings
     laws = np.array(recorded.signals["law"].to_pylist())
     displayed = recorded.column("force_applied")
-    for _, wall in settings.walls[:2]:
+    for wall in [stage.wall for stage in settings.stages[:2]]:
         held = effort(recorded, wall)
         # Where the law was displayed, what it would have held is what the drive applied.
         own = np.flatnonzero((laws[:-1] == wall.law) & (displayed[1:] != 0.0)) + 1
