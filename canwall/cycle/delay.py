@@ -1,22 +1,22 @@
 """The delay D of the loop, measured: from the sampling of a position to its torque taking effect.
 
 A drive does not say it. So the motor is shaken by small torques in pairs, one way and back, of
-random sign, and D is found in how the position follows: for a torque held over one period and
-delayed by D = n + δ periods, the second difference of the position is, but for friction,
-
-    y[j+1] − 2·y[j] + y[j−1] = T²/(2m) · Σᵢ cᵢ(δ) · u[j−n−i],
-    c = ((1−δ)², 1 + 2δ − 2δ², δ²)
-
-which is the zero-order hold of a mass sampled δ·T after the torque changes (theory, section 3).
+random sign, and D is found in how the position follows: as that D, mass, friction and spring with
+which the exact motion under these torques comes closest to it. What is compared is the position
+less its moving average, in which a hand that moves slowly does not show.
 """
 
 import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
+from scipy.ndimage import uniform_filter1d
+from scipy.optimize import least_squares
 
+from canwall.compiled import Record, compiled
+from canwall.config import Mechanics
 from canwall.cycle.axis import Axis
+from canwall.physics import advance, make_plant
 from canwall.walls import MAX_DELAY
 
 Array = NDArray[np.float64]
@@ -25,6 +25,12 @@ Array = NDArray[np.float64]
 _SEED = 402
 #: The share of the motion that the model has to explain, for a delay to be believed.
 _EXPLAINED = 0.5
+#: Delays from which the fit begins, in periods.
+_GUESSES = np.arange(0.0, MAX_DELAY + 0.1, 0.5)
+#: How far a pair of torques is to move the handle [rad]: many counts, and little for a hand.
+_TRAVEL_RAD = 0.01
+#: The longest torque, and the moving average, in cycles.
+_LONGEST, _AVERAGED = 8, 33
 
 
 class DelayTest:
@@ -35,8 +41,11 @@ class DelayTest:
         self.axis = axis
         self.cycles = settings.estimator.measure_cycles
         torque = min(settings.estimator.measure_torque_nm, settings.limits.torque_nm)
-        per_mille = max(1, math.floor(torque / float(axis.cycle["nm_per_mille"][0])))
-        self._torques = per_mille * excitation(self.cycles)
+        # A torque f for n periods, and back: the handle moves by f·(nT)²/m.
+        farthest = _TRAVEL_RAD * settings.mechanics.inertia_kg_m2 / settings.bus.cycle_s**2
+        length = min(max(1, math.floor(math.sqrt(farthest / torque))), _LONGEST)
+        per_mille = min(torque, farthest) / float(axis.cycle["nm_per_mille"][0])
+        self._torques = max(1, math.floor(per_mille)) * excitation(self.cycles, length)
         self._positions: list[float] = []
         self._forces: list[float] = []
 
@@ -53,59 +62,91 @@ class DelayTest:
 
     def delay(self) -> float:
         """D in periods. Raises ValueError where the motion does not tell."""
-        return measured_delay(np.array(self._positions), np.array(self._forces))
+        settings = self.axis.settings
+        return measured_delay(
+            np.array(self._positions),
+            np.array(self._forces),
+            settings.bus.cycle_s,
+            settings.mechanics,
+        )
 
 
-def excitation(cycles: int) -> NDArray[np.int64]:
-    """Signs of the torque, shape (cycles,): pairs that give the handle no lasting speed."""
-    signs = np.random.default_rng(_SEED).choice([-1, 1], size=(cycles + 1) // 2)
-    pairs = np.stack([signs, -signs], axis=1)
-    return np.asarray(pairs.reshape(-1)[:cycles], dtype=np.int64)
+def excitation(cycles: int, length: int) -> NDArray[np.int64]:
+    """Signs of the torque, shape (cycles,): pairs that give the handle no lasting speed.
+
+    Each torque of a pair lasts for `length` cycles; a pair that would not be complete is none.
+    """
+    signs = np.random.default_rng(_SEED).choice([-1, 1], size=cycles // (2 * length))
+    pairs = np.stack([signs, -signs], axis=1).reshape(-1).repeat(length)
+    return np.concatenate([pairs, np.zeros(cycles - len(pairs))]).astype(np.int64)
 
 
-def measured_delay(position: Array, torque: Array) -> float:
+def measured_delay(position: Array, torque: Array, period: float, mechanics: Mechanics) -> float:
     """D in periods from positions [rad] at each SYNC and the torques [N·m] commanded after it.
 
-    Both of shape (n,). Beside inertia, the fit has viscous and Coulomb friction, a spring and a
-    constant. Raises ValueError where the torques do not explain the motion.
+    Both of shape (n,); a position that is missing is NaN. The fit starts from `mechanics`, at rest
+    in the first position. Raises ValueError where the torques do not explain the motion.
     """
+    known = np.isfinite(position)
+    j = np.arange(len(position))
+    start = float(position[known][0]) if known.any() else 0.0
+    size = _rms(_fast(np.interp(j, j[known], position[known]))) if known.any() else 0.0
+    scales = _scales(period, mechanics, float(np.abs(torque).max(initial=0.0)))
 
-    def unexplained(delay: float) -> float:
-        return _residual(position, torque, delay)
+    def misses(parameters: Array) -> Array:
+        miss = _motion(parameters * scales, start, torque, period) - position
+        return _fast(np.interp(j, j[known], miss[known])) / size
 
-    coarse = np.arange(0.0, MAX_DELAY + 0.01, 0.25)
-    best = coarse[int(np.argmin([unexplained(delay) for delay in coarse]))]
-    low, high = max(0.0, best - 0.25), min(float(MAX_DELAY), best + 0.25)
-    found = minimize_scalar(unexplained, bounds=(low, high), method="bounded")
-    ends = {unexplained(end): end for end in (low, high)}
-    delay = float(found.x) if found.fun <= min(ends) else ends[min(ends)]
-    if not unexplained(delay) < 1.0 - _EXPLAINED:
-        raise ValueError(
-            "the delay cannot be measured: the handle does not follow small torques; let it go, "
-            "give more estimator.measure_torque_nm, or set estimator.delay_cycles"
-        )
-    return delay
-
-
-def _residual(position: Array, torque: Array, delay: float) -> float:
-    """Share of the motion's variance that the best fit with this delay leaves unexplained."""
-    n = min(math.floor(delay), MAX_DELAY)
-    share = delay - n
-    kernel = np.array([(1.0 - share) ** 2, 1.0 + 2.0 * share - 2.0 * share**2, share**2]) / 2.0
-    held = np.concatenate([np.zeros(n), np.convolve(torque, kernel)])
-    j = np.arange(MAX_DELAY + 3, len(position) - 1)
-    acceleration = position[j + 1] - 2.0 * position[j] + position[j - 1]
-    speed = position[j + 1] - position[j - 1]
-    fit = np.stack([held[j], speed, np.sign(speed), position[j], np.ones(len(j))], axis=1)
-    known = np.isfinite(acceleration)
-    acceleration, fit = (
-        acceleration[known],
-        fit[known] / np.abs(fit[known]).max(axis=0).clip(1e-300),
+    if size > 0.0:
+        guesses = [np.array([1.0, 1.0, 0.0, 0.1, 0.0, delay]) for delay in _GUESSES]
+        guess = min(guesses, key=lambda parameters: float(np.sum(misses(parameters) ** 2)))
+        low = np.array([1e-3, 0.0, 0.0, 0.0, -1.0, 0.0])
+        high = np.array([1e3, 1e3, 1e3, 1.0, 1.0, float(MAX_DELAY)])
+        inside = np.clip(guess, low + 1e-6, high - 1e-6)
+        fit = least_squares(misses, inside, bounds=(low, high), x_scale=0.1)
+        if _rms(fit.fun) ** 2 < 1.0 - _EXPLAINED:
+            return float(fit.x[-1])
+    raise ValueError(
+        "the delay cannot be measured: the handle does not follow small torques; let it go, "
+        "give more estimator.measure_torque_nm, or set estimator.delay_cycles"
     )
-    if len(acceleration) <= fit.shape[1]:
-        return 1.0
-    coefficients = np.linalg.lstsq(fit, acceleration, rcond=None)[0]
-    left = acceleration - fit @ coefficients
-    if not coefficients[0] > 0.0:
-        return 1.0
-    return float(left @ left / (acceleration @ acceleration))
+
+
+def _fast(signal: Array) -> Array:
+    """A signal less its moving average."""
+    return np.asarray(signal - uniform_filter1d(signal, _AVERAGED, mode="nearest"))
+
+
+def _rms(signal: Array) -> float:
+    return float(np.sqrt(np.mean(signal**2)))
+
+
+def _scales(period: float, mechanics: Mechanics, torque: float) -> Array:
+    """Units of mass, viscous friction, spring, Coulomb friction, bias and delay in the fit."""
+    mass = mechanics.inertia_kg_m2
+    viscous = max(mechanics.viscous_nm_s_per_rad, 1e-3 * mass / period)
+    spring = 0.01 * mass / period**2
+    return np.array([mass, viscous, spring, torque, torque, 1.0])
+
+
+def _motion(parameters: Array, start: float, torque: Array, period: float) -> Array:
+    mass, viscous, spring, coulomb, bias, delay = parameters
+    whole = min(math.floor(delay), MAX_DELAY)
+    held = np.concatenate([np.zeros(whole + 1), torque]) + bias + spring * start
+    position = np.empty(len(torque))
+    plant = make_plant(mass, viscous, spring, coulomb)
+    _follow(plant, start, held, (delay - whole) * period, period, position)
+    return position
+
+
+@compiled
+def _follow(
+    plants: NDArray[np.void], start: float, held: Array, late: float, period: float, position: Array
+) -> None:
+    """Positions at each SYNC under forces that change `late` after it."""
+    plant: Record = plants[0]
+    y, v = start, 0.0
+    for j in range(len(position)):
+        position[j] = y
+        y, v, _ = advance(plant, y, v, held[j], 0.0, late)
+        y, v, _ = advance(plant, y, v, held[j + 1], 0.0, period - late)

@@ -1,0 +1,109 @@
+"""The delay D: by the fit alone, and as the loop measures it on the simulated drive."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rig import Loop, RigFactory, settings_with
+
+from canwall.config import Mechanics
+from canwall.cycle import measured_delay
+from canwall.cycle.delay import excitation
+from canwall.physics import zoh
+from canwall.record import Phase
+
+COUNT = 2.0 * np.pi / 131072
+PERIOD = 1e-3
+#: What the master believes of the handle.
+KNOWN = Mechanics(inertia_kg_m2=2e-4, viscous_nm_s_per_rad=1e-3)
+
+
+def response(
+    torque: np.ndarray, delay: float, mass: float, viscous: float, period: float
+) -> np.ndarray:
+    """Positions at each SYNC under torques that take effect `delay` periods after them.
+
+    By the zero-order-hold equivalent over the two parts of each period (theory, section 3).
+    """
+    n = int(delay)
+    share = delay - n
+    parts = [zoh(mass, viscous, 0.0, part * period) for part in (share, 1.0 - share)]
+    held = np.concatenate([np.zeros(n + 1), torque])
+    state = np.zeros(2)
+    position = np.zeros(len(torque))
+    for j in range(len(torque)):
+        position[j] = state[0]
+        for (phi, gamma), force in zip(parts, (held[j], held[j + 1]), strict=True):
+            state = phi @ state + gamma * force
+    return position
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    delay=st.floats(0.0, 3.0),
+    mass=st.floats(5e-5, 1e-3),
+    viscous=st.floats(0.0, 0.03),
+)
+def test_fit_finds_the_delay(delay: float, mass: float, viscous: float) -> None:
+    torque = 0.15 * excitation(400, 2)
+    position = response(torque, delay, mass, viscous, PERIOD)
+    found = measured_delay(position, torque, PERIOD, KNOWN)
+    assert found == pytest.approx(delay, abs=1e-3)
+
+
+def test_encoder_hides_little_of_the_delay() -> None:
+    torque = 0.15 * excitation(400, 3)
+    for delay in (0.0, 0.35, 1.0, 1.5, 2.0):
+        position = response(torque, delay, 1.64e-4, 5e-4, PERIOD)
+        counts = np.round(position / COUNT) * COUNT
+        assert measured_delay(counts, torque, PERIOD, KNOWN) == pytest.approx(delay, abs=0.02)
+
+
+def test_missing_positions_are_left_out() -> None:
+    torque = 0.15 * excitation(400, 3)
+    position = response(torque, 1.0, 1.64e-4, 5e-4, PERIOD)
+    position[::37] = np.nan
+    assert measured_delay(position, torque, PERIOD, KNOWN) == pytest.approx(1.0, abs=0.02)
+
+
+def test_handle_that_does_not_follow_tells_nothing() -> None:
+    torque = 0.15 * excitation(400, 3)
+    noise = np.random.default_rng(1).normal(size=400) * COUNT
+    for position in (np.zeros(400), noise):
+        with pytest.raises(ValueError, match="the delay cannot be measured"):
+            measured_delay(position, torque, PERIOD, KNOWN)
+
+
+def test_excitation_gives_the_handle_no_lasting_speed() -> None:
+    for length in (1, 3, 8):
+        signs = excitation(401, length)
+        assert signs.shape == (401,)
+        assert set(signs.tolist()) == {-1, 0, 1}
+        assert np.abs(np.cumsum(signs)).max() == length
+        assert np.cumsum(signs)[-1] == 0
+
+
+@pytest.mark.parametrize("given", [0.0, 0.35, 1.0, 2.0])
+def test_loop_measures_the_delay_that_the_drive_was_given(
+    make_rig: RigFactory, given: float
+) -> None:
+    asynchronous = given < 1.0
+    extra = given if asynchronous else given - 1.0
+    settings = settings_with(
+        {"estimator.measure_delay": True, "simulation.torque_delay_cycles": extra}
+    )
+    assert settings.simulation is not None
+    at_rest = settings.simulation.hand.model_copy(update={"first_strike_s": 1.0})
+    simulation = settings.simulation.model_copy(update={"hand": at_rest})
+    rig = make_rig(settings.model_copy(update={"simulation": simulation}))
+    loop = Loop(rig)
+    if asynchronous:
+        rig.node.write(0x1400, 2, 255)
+    outcome = loop.run(420)
+    assert outcome.trips == []
+    # Within 2 %, and of a period where there is no delay.
+    assert loop.axis.delay == pytest.approx(given, rel=0.02, abs=0.02 if given == 0.0 else 0.0)
+    rows = loop.rows()
+    measuring = rows[rows["phase"] == Phase.MEASURING]
+    assert len(measuring) == 400
+    assert np.ptp(measuring["position_rad"]) < 0.05
