@@ -6,7 +6,7 @@ Prepare everything that can fail on bad input, then touch the bus, then the driv
 import json
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,6 +29,7 @@ from canwall.cycle import (
     Outcome,
     PythonCanExchange,
     Watch,
+    real_time_priority,
     run_loop,
     timing_summary,
 )
@@ -235,7 +236,7 @@ def run_together(
             exchange = make_exchange(link, axes)
             watch = make_watch(link, axes)
             report("rendering")
-            with stop_on_signals() as stop:
+            with stop_on_signals() as stop, scheduled(first) as scheduling:
                 outcome = render(
                     exchange, stop, lambda now_s: progress(now_s, first.run.duration_s)
                 )
@@ -245,8 +246,18 @@ def run_together(
     results = []
     for axis, folder, noted in zip(axes, folders, notes, strict=True):
         said = [*noted, *watch.notes] if axis is axes[0] else noted
-        results.append(_result(axis, exchange, watch, folder, outcome, said))
+        results.append(_result(axis, exchange, watch, scheduling, folder, outcome, said))
+    report("drawing")
+    for folder in folders:
+        plot_run(folder)
     return results
+
+
+def scheduled(settings: Settings) -> AbstractContextManager[str]:
+    """Real-time priority for a run that keeps to the clock; tells what was granted."""
+    if settings.real_time:
+        return real_time_priority()
+    return nullcontext("simulated time")
 
 
 def _check_together(many: Sequence[Settings]) -> None:
@@ -274,11 +285,12 @@ def _result(
     axis: Axis,
     exchange: PythonCanExchange,
     watch: Watch,
+    scheduling: str,
     folder: RunFolder,
     outcome: Outcome,
     notes: list[str],
 ) -> RunResult:
-    """Summary and pictures of one axis."""
+    """Summary of one axis, and its last cycles where it tripped."""
     settings = axis.settings
     signals = _recorded(folder, [*outcome.trips, *notes])
     asked_for = (signals[name].to_numpy() for name in ("stiffness", "damping", "wall_position_rad"))
@@ -294,6 +306,7 @@ def _result(
         "delay_cycles": axis.delay,
         "drive": _described(axis.setup),
         "timing": {
+            "scheduling": scheduling,
             "sync_interval": timing_summary(exchange.sync_interval),
             "tpdo_to_rpdo": timing_summary(axis.latency),
         },
@@ -301,7 +314,6 @@ def _result(
     folder.summary.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     if outcome.trip_cycle is not None:
         folder.write_trip(signals, outcome.trip_cycle)
-    plot_run(folder)
     return RunResult(folder, summary, outcome, notes)
 
 

@@ -97,7 +97,8 @@ def test_help_of_a_command(say: Say, name: str, words: list[str]) -> None:
         (["run", "--stifness", "3"], "No such option: --stifness"),
         (["walk"], "No such command 'walk'"),
         (["run", "--stiffness", "soft"], "Invalid value for '--stiffness'"),
-        (["run", "one.toml", "two.toml"], "Got unexpected extra argument"),
+        (["drive", "one.toml", "two.toml"], "Got unexpected extra argument"),
+        (["run", "one.toml", "two.toml"], "one.toml: no such file"),
         (["plot"], "Missing argument 'DIR'"),
     ],
 )
@@ -260,7 +261,7 @@ def test_exit_codes(
     def fail(*args: object) -> None:
         raise error
 
-    monkeypatch.setattr(canwall.run, "run", fail)
+    monkeypatch.setattr(canwall.run, "run_together", fail)
     said = say("run")
     assert (said.code, said.err) == (code, err)
 
@@ -271,7 +272,7 @@ def test_what_is_wrong_in_a_program_is_not_hidden(
     def fail(*args: object) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(canwall.run, "run", fail)
+    monkeypatch.setattr(canwall.run, "run_together", fail)
     with pytest.raises(ZeroDivisionError):
         cli._guarded(lambda: cli.app(["run"], standalone_mode=False))
 

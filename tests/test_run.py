@@ -1,5 +1,6 @@
 """The main job in processes of its own: what a run leaves, and who may share machine and bus."""
 
+import itertools
 import signal
 import struct
 import subprocess
@@ -374,11 +375,10 @@ def test_trip_is_the_outcome(tmp_path: Path) -> None:
 def test_start_inside_the_wall(tmp_path: Path) -> None:
     file = config_file(tmp_path / "c.toml", {"position_rad = 0.0\n": "position_rad = 0.2\n"})
     done = command("run", file, "--output", tmp_path / "run")
-    assert done.returncode == 1
-    assert "the handle is 0.1 rad inside the wall" in done.stderr
-    assert all(
-        struct.unpack("<Hh", rpdo) == (0x00, 0) for _, rpdo in Record(tmp_path / "run").cycles
-    )
+    assert (done.returncode, done.stderr) == (0, "")
+    torques = [struct.unpack("<Hh", rpdo)[1] for _, rpdo in Record(tmp_path / "run").cycles]
+    # 5 N·m would be the full wall's: 100 torque steps a cycle at the most, from none.
+    assert max(abs(a - b) for a, b in itertools.pairwise(torques[:100])) < 100
 
 
 def test_bus_that_fails_before_the_first_cycle(

@@ -4,6 +4,7 @@ from canwall.cycle.axis import Axis, Change
 from canwall.cycle.delay import measured_delay
 from canwall.cycle.exchange import PythonCanExchange
 from canwall.cycle.loop import Outcome, run_loop
+from canwall.cycle.realtime import real_time_priority
 from canwall.cycle.step import CYCLE, MAX_LAWS, Trip, make_cycle, set_wall, step
 from canwall.cycle.sync import ExternalSync, ProducedSync
 from canwall.cycle.timing import HISTOGRAM, observe_ns, percentile_ns, timing_summary
@@ -25,6 +26,7 @@ __all__ = [
     "measured_delay",
     "observe_ns",
     "percentile_ns",
+    "real_time_priority",
     "run_loop",
     "set_wall",
     "step",

@@ -39,7 +39,7 @@ class Link:
 
     def __init__(self, bus: can.BusABC, idle: Callable[[], None] | None = None) -> None:
         self._bus = bus
-        self._idle = idle
+        self.idle = idle
         self.log: FrameLog | None = None
         self.on_error_frame: Callable[[can.Message], None] | None = None
         self.network = _Network(self)
@@ -52,7 +52,7 @@ class Link:
 
     def receive(self, timeout_s: float) -> can.Message | None:
         """The next frame, or None if there is none within the time. Raises can.CanError."""
-        if self._idle is None:
+        if self.idle is None:
             message = self._bus.recv(timeout_s)
         else:
             message = self._receive_idling(timeout_s)
@@ -61,13 +61,13 @@ class Link:
         return message
 
     def _receive_idling(self, timeout_s: float) -> can.Message | None:
-        assert self._idle is not None
+        assert self.idle is not None
         deadline = time.monotonic() + timeout_s
         while True:
             message = self._bus.recv(0)
             if message is not None or time.monotonic() >= deadline:
                 return message
-            self._idle()
+            self.idle()
 
     def wait_for(self, can_ids: Container[int], timeout_s: float) -> can.Message | None:
         """The next data frame with one of these identifiers; others go to the network."""

@@ -13,6 +13,7 @@ from typing import Any, TypeAlias
 
 from on_the_ball import ball, law_steps, planning_steps
 from on_the_bus import exchange, simulated_drive, whole_loop
+from on_the_clock import several_drives, sync_jitter
 
 Benchmark: TypeAlias = Callable[[], dict[str, Any]]
 
@@ -20,6 +21,8 @@ BENCHMARKS: dict[str, Benchmark] = {
     "whole_loop": whole_loop,
     "exchange": exchange,
     "simulated_drive": simulated_drive,
+    "several_drives": several_drives,
+    "sync_jitter": sync_jitter,
     "law_steps": law_steps,
     "planning_steps": planning_steps,
     "ball": ball,

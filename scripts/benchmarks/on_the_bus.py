@@ -19,18 +19,19 @@ from numpy.typing import NDArray
 
 from canwall import config, simdrive
 from canwall.config import Settings
-from canwall.cycle import PythonCanExchange, make_cycle, step
+from canwall.cycle import Axis, PythonCanExchange, step
 from canwall.cycle.step import start_at
 from canwall.drive import REQUIRED_OBJECTS, DriveNode, DriveSetup, Link, set_up
 from canwall.eds import load_eds
 from canwall.record import ROW, Phase, Recorder, Ring
 from canwall.run import (
     drive_dictionary,
+    make_axis,
+    make_exchange,
     make_simulated_drive,
     on_the_bus,
     render,
     run_laws,
-    set_up_bench,
 )
 
 _REPEATS = 7
@@ -65,9 +66,10 @@ def _rate_of_run(settings: Settings) -> float:
     with tempfile.TemporaryDirectory() as folder, on_the_bus(settings) as link:
         recorder = Recorder(Path(folder), "bus.log", "bench", [law.name for law in laws])
         link.log = recorder.ring.log_frame
-        bench = set_up_bench(link, settings, drive_dictionary(settings), laws, recorder.ring)
+        axis = make_axis(link, settings, drive_dictionary(settings), laws, recorder.ring)
+        exchange = make_exchange(link, [axis])
         begin = time.perf_counter()
-        outcome = render(bench, settings, laws, stop=lambda: False)
+        outcome = render(exchange, stop=lambda: False)
         duration = time.perf_counter() - begin
         notes = recorder.close()
     if outcome.trips or notes:
@@ -106,8 +108,17 @@ class _Ready:
     drive: simdrive.SimulatedDrive
     runner: simdrive.BusRunner
     link: Link
-    setup: DriveSetup
-    cycle: NDArray[np.void]
+    axis: Axis
+
+    @property
+    def setup(self) -> DriveSetup:
+        """What the drive's set-up came to."""
+        return self.axis.setup
+
+    @property
+    def cycle(self) -> NDArray[np.void]:
+        """The record of the wall."""
+        return self.axis.cycle
 
 
 @contextmanager
@@ -127,10 +138,10 @@ def _ready() -> Iterator[_Ready]:
         setup = set_up(node, settings.drive)
         for controlword in (0x06, 0x07, _ENABLE_OPERATION):
             node.write(0x6040, 0, controlword)
-        cycle = make_cycle(settings, setup, run_laws(settings))
-        cycle["phase"], cycle["controlword"] = Phase.RENDERING, _ENABLE_OPERATION
-        start_at(cycle, node.read(0x6064))
-        yield _Ready(bus, drive, runner, link, setup, cycle)
+        axis = Axis(node, setup, settings, run_laws(settings), Ring.create())
+        axis.cycle["phase"], axis.cycle["controlword"] = Phase.RENDERING, _ENABLE_OPERATION
+        start_at(axis.cycle, node.read(0x6064))
+        yield _Ready(bus, drive, runner, link, axis)
 
 
 def exchange() -> dict[str, Any]:
@@ -157,9 +168,8 @@ def _percentiles(durations_ns: NDArray[np.int64]) -> dict[str, float]:
 
 def _durations_of_canwall() -> NDArray[np.int64]:
     with _ready() as ready:
-        ring = Ring.create()
-        ready.link.log = ring.log_frame
-        exchange = PythonCanExchange(ready.link, ready.setup, ready.cycle, ring, real_time=False)
+        ready.link.log = ready.axis.ring.log_frame
+        exchange = PythonCanExchange(ready.link, [ready.axis], real_time=False)
         for _ in range(_CYCLES):
             exchange.cycle()
         return _checked(ready)

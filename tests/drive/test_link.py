@@ -100,7 +100,7 @@ def test_remote_and_error_frames_are_ignored(rig: Rig) -> None:
     from_the_drive(rig, 0x185, b"", is_remote_frame=True)
     from_the_drive(rig, 0x185, b"late", is_error_frame=True)
     from_the_drive(rig, 0x185, b"data")
-    message = rig.link.wait_for(0x185, 1.0)
+    message = rig.link.wait_for((0x185,), 1.0)
     assert message is not None
     assert bytes(message.data) == b"data"
 
@@ -109,12 +109,12 @@ def test_wait_for_hands_the_rest_to_the_network(rig: Rig) -> None:
     from_the_drive(rig, 0x085, struct.pack("<HB5s", 0x4210, 1, bytes(5)))
     from_the_drive(rig, 0x185, b"mine")
     from_the_drive(rig, 0x285, b"next")
-    assert rig.link.wait_for(0x185, 1.0) is not None
+    assert rig.link.wait_for((0x185,), 1.0) is not None
     assert len(rig.node.emergencies) == 1
     message = rig.link.receive(0.0)
     assert message is not None
     assert message.arbitration_id == 0x285
-    assert rig.link.wait_for(0x185, 0.0) is None
+    assert rig.link.wait_for((0x185,), 0.0) is None
 
 
 def test_everything_is_noted(rig: Rig) -> None:
