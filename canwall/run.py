@@ -130,7 +130,7 @@ def set_up_bench(
     `dictionary` is what `[drive] eds` describes. Nothing is enabled yet. Raises DriveError.
     """
     node = DriveNode(link, settings.drive.node_id, dictionary)
-    setup = set_up(node, settings.drive)
+    setup = set_up(node, settings.drive, settings.bus, settings.real_time)
     cycle = make_cycle(settings, setup, laws)
     exchange = PythonCanExchange(link, setup, cycle, ring, settings.real_time)
     return Bench(node, setup, cycle, exchange)

@@ -70,6 +70,7 @@ class PythonCanExchange:
         self._tpdo_id = setup.tpdo.cob_id
         self._tpdo_length = setup.tpdo.length
         self._rpdo_length = setup.rpdo.length
+        self._rpdo_constant = setup.rpdo.constant
         self._sync = _CyclicFrame(setup.sync_cob_id, 0)
         self._rpdo = _CyclicFrame(setup.rpdo.cob_id, setup.rpdo.length)
         self.row = np.zeros(1, ROW)
@@ -101,7 +102,7 @@ class PythonCanExchange:
         received_ns = time.perf_counter_ns()
         data = data_to_number(message.data) if message is not None else 0
         answer = step(self._cycle, self.row, data, message is not None)
-        self._rpdo.data[:] = number_to_data(answer, self._rpdo_length)
+        self._rpdo.data[:] = number_to_data(answer | self._rpdo_constant, self._rpdo_length)
         self._link.send(self._rpdo)
         self._note(sync_ns, received_ns, time.perf_counter_ns())
 

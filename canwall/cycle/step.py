@@ -129,7 +129,7 @@ def make_cycle(settings: Settings, setup: DriveSetup, laws: Sequence[Law]) -> ND
     cycle["period"] = period
     cycle["rad_per_count"] = units.rad_per_count
     cycle["nm_per_mille"] = units.nm_per_mille
-    cycle["torque_limit"] = limits.torque_nm
+    cycle["torque_limit"] = min(limits.torque_nm, setup.torque_limit_nm)
     cycle["speed_limit"] = limits.speed_rad_s
     cycle["position_low"], cycle["position_high"] = limits.position_rad
     cycle["hold_cycles"] = limits.hold_cycles
