@@ -124,7 +124,7 @@ def make_axis(
     `dictionary` is what `[drive] eds` describes. Nothing is enabled yet. Raises DriveError.
     """
     node = DriveNode(link, settings.drive.node_id, dictionary)
-    setup = set_up(node, settings.drive)
+    setup = set_up(node, settings.drive, settings.bus, settings.real_time)
     period = settings.bus.cycle_s
     changes = [
         Change(round(at_s / period), wall, limits) for at_s, wall, limits in settings.stages[1:]

@@ -113,7 +113,7 @@ class Rig:
         self.drive_bus.shutdown()
 
     def set_up(self) -> DriveSetup:
-        return set_up(self.node, self.settings.drive)
+        return set_up(self.node, self.settings.drive, self.settings.bus, self.settings.real_time)
 
     def inject(self, can_id: int, data: bytes) -> None:
         """A frame of somebody else, for master and drive."""

@@ -4,11 +4,11 @@ Every key carries its unit in its name. What is unknown, misspelt, of the wrong 
 is a `ConfigError` of one line: file, key, what is wrong, what to do.
 """
 
+from canwall.config.drive import Drive
 from canwall.config.reading import ConfigError, absolute_law, load, shipped
 from canwall.config.settings import (
     Bus,
     Change,
-    Drive,
     Estimator,
     Limits,
     Mechanics,

@@ -1,11 +1,11 @@
 """The sections of a configuration, and what they say together."""
 
-from pathlib import Path
 from typing import Annotated, Literal, NamedTuple, Self
 
 import tomli_w
 from pydantic import Field, field_validator, model_validator
 
+from canwall.config.drive import Drive
 from canwall.config.section import NonNegative, Number, Positive, Section
 from canwall.config.simulation import Simulation
 
@@ -19,23 +19,7 @@ class Bus(Section):
     cycle_s: Annotated[Positive, Field(le=1.0)] = 0.001
     pace: Literal["auto", "real_time", "simulated"] = "auto"
     sync: Literal["produce", "external"] = "produce"
-
-
-class Drive(Section):
-    """`[drive]`: which node, described by which EDS or DCF."""
-
-    node_id: int = Field(ge=1, le=127)
-    eds: Path
-    mode: Literal["auto", "cst"] = "auto"
-    rated_torque_nm: Positive | None = None
-    counts_per_rev: Positive | None = None
-    gear_ratio: Positive | None = None
-    wait_s: NonNegative = 5.0
-
-    @field_validator("eds", mode="before")
-    @classmethod
-    def _path(cls, value: object) -> object:
-        return Path(value) if isinstance(value, str) else value
+    master_id: int = Field(127, ge=1, le=127)
 
 
 class Mechanics(Section):
@@ -174,6 +158,11 @@ class Settings(Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
+        if self.drive.node_id == self.bus.master_id:
+            raise ValueError(
+                f"bus.master_id = {self.bus.master_id} is the drive's own node-ID: no two nodes of "
+                f"a bus may share one"
+            )
         if [c.at_s for c in self.schedule] != sorted(c.at_s for c in self.schedule):
             raise ValueError("schedule: the entries have to be in the order of at_s")
         if self.wall.alternate and any(change.law for change in self.schedule):

@@ -39,8 +39,12 @@ class Hand(Section):
 class Simulation(Section):
     """`[simulation]`: the mechanics of the simulated drive, and the hand on its handle.
 
-    Rated torque and encoder are those of the dictionary (0x6076, 0x608F) where it has them. What
-    is stored over 0x1010 outlives the drive in the file `store`, if there is one.
+    Rated torque and encoder are those of the dictionary (0x6076, 0x608F) where it has them. The
+    motor's torque has its limit at `peak_torque_nm` (three times the rated torque, unless given),
+    and falls back to the rated torque when the peak has lasted for `overload_s`, or less of it for
+    longer (I²t). The limit switches are closed outside `limit_switches_rad`, the home switch
+    within `home_switch_rad`. What is stored over 0x1010 outlives the drive in the file `store`, if
+    there is one.
 
     Time is one `[bus] cycle_s` per SYNC or, with `real_time`, what is measured. The torque of an
     RPDO acts `torque_delay_cycles` periods after the SYNC (synchronous) or the arrival (254, 255).
@@ -51,10 +55,27 @@ class Simulation(Section):
     inertia_kg_m2: Positive = 1.0e-4
     viscous_nm_s_per_rad: NonNegative = 5.0e-4
     coulomb_nm: NonNegative = 0.01
+    peak_torque_nm: Positive | None = None
+    overload_s: NonNegative = 3.0
+    dc_link_v: Annotated[Positive, Field(le=1000.0)] = 48.0
+    limit_switches_rad: tuple[Number, Number] | None = None
+    home_switch_rad: tuple[Number, Number] | None = None
     store: Path | None = None
     real_time: bool = False
     torque_delay_cycles: Annotated[NonNegative, Field(le=1000.0)] = 0.0
     hand: Hand = Hand()
+
+    @field_validator("limit_switches_rad", "home_switch_rad", mode="before")
+    @classmethod
+    def _pair(cls, value: object) -> object:
+        return tuple(value) if isinstance(value, list) else value
+
+    @field_validator("limit_switches_rad", "home_switch_rad")
+    @classmethod
+    def _ordered(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
+        if value is not None and not value[0] < value[1]:
+            raise ValueError("the lower position has to come first and lie below the upper one")
+        return value
 
     @field_validator("store", mode="before")
     @classmethod

@@ -55,4 +55,6 @@ class Axis:
     @property
     def measures_delay(self) -> bool:
         """Whether the delay is to be measured before the wall is rendered."""
-        return self.settings.estimator.measure_delay
+        estimator = self.settings.estimator
+        known = estimator.delay_cycles is not None or self.setup.synchronous
+        return estimator.measure_delay or not known

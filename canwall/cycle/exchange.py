@@ -7,6 +7,7 @@ import numpy as np
 
 from canwall.compiled import data_to_number, number_to_data
 from canwall.cycle.axis import Axis
+from canwall.cycle.beats import Beats
 from canwall.cycle.frames import CyclicFrame
 from canwall.cycle.step import step
 from canwall.cycle.sync import ProducedSync, SyncSource
@@ -55,6 +56,7 @@ class PythonCanExchange:
         self._rpdos = {
             id(axis): CyclicFrame(axis.setup.rpdo.cob_id, axis.setup.rpdo.length) for axis in axes
         }
+        self._beats = Beats(link, (axis.setup.watchdog for axis in axes))
         self.sync_interval = np.zeros(1, HISTOGRAM)
         self._last_sync_ns = 0
         self._writer_reads = True
@@ -86,6 +88,8 @@ class PythonCanExchange:
                 timeout = max(0.0, deadline - time.monotonic())
         for axis in awaited.values():
             self._answer(axis, 0, False, time.perf_counter_ns(), interval_s)
+        if self._beats:
+            self._beats.send()
 
     def _drop_late(self) -> None:
         # The TPDO that was missed may have come since. Taken for the next one, it would leave
@@ -116,6 +120,7 @@ class PythonCanExchange:
     ) -> None:
         answer = step(axis.cycle, axis.row, data, received)
         rpdo = self._rpdos[id(axis)]
+        answer |= axis.setup.rpdo.constant
         rpdo.data[:] = number_to_data(answer, axis.setup.rpdo.length)
         self._link.send(rpdo)
         sent_ns = time.perf_counter_ns()

@@ -102,6 +102,7 @@ CYCLE = np.dtype(
         ("period", "f8"),
         ("rad_per_count", "f8"),
         ("nm_per_mille", "f8"),
+        ("drive_torque_limit", "f8"),
         ("torque_limit", "f8"),
         ("torque_rate", "f8"),
         ("speed_limit", "f8"),
@@ -164,6 +165,7 @@ def make_cycle(settings: Settings, setup: DriveSetup, laws: Sequence[Law]) -> ND
     cycle["rad_per_count"] = setup.units.rad_per_count
     cycle["nm_per_mille"] = setup.units.nm_per_mille
     cycle["strike_gap"] = round(STRIKE_GAP_S / period)
+    cycle["drive_torque_limit"] = setup.torque_limit_nm
     for i, law in enumerate(laws):
         cycle["laws"][0, i] = law.address
     delay = settings.estimator.delay_cycles
@@ -203,7 +205,7 @@ def _set_field(cycle: NDArray[np.void], name: str, layout: PdoLayout, index: int
 
 def set_limits(cycle: NDArray[np.void], limits: Limits) -> None:
     """Change the limits between two cycles."""
-    cycle["torque_limit"] = limits.torque_nm
+    cycle["torque_limit"] = min(limits.torque_nm, cycle["drive_torque_limit"].item())
     cycle["torque_rate"] = limits.torque_rate_nm_per_s or math.inf
     cycle["speed_limit"] = limits.speed_rad_s
     cycle["position_low"], cycle["position_high"] = limits.position_rad

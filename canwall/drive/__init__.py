@@ -5,28 +5,37 @@ One python-can bus, one thread: what waits for an answer reads the bus itself.
 
 from canwall.drive.cia402 import (
     Controlword,
+    Enabling,
     State,
     controlword_down,
     controlword_up,
     state_of,
+    status_text,
 )
 from canwall.drive.link import Link
 from canwall.drive.node import DriveError, DriveNode
 from canwall.drive.pdo import Field, PdoLayout
-from canwall.drive.setup import REQUIRED_OBJECTS, DriveSetup, set_up
+from canwall.drive.setup import REQUIRED_OBJECTS, DriveSetup, disable, set_up
+from canwall.drive.watchdog import NO_WATCHDOG, Beat, Watchdog
 
 __all__ = [
+    "NO_WATCHDOG",
     "REQUIRED_OBJECTS",
+    "Beat",
     "Controlword",
     "DriveError",
     "DriveNode",
     "DriveSetup",
+    "Enabling",
     "Field",
     "Link",
     "PdoLayout",
     "State",
+    "Watchdog",
     "controlword_down",
     "controlword_up",
+    "disable",
     "set_up",
     "state_of",
+    "status_text",
 ]

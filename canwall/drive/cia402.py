@@ -33,6 +33,22 @@ class Controlword(IntEnum):
     FAULT_RESET = 0x80
 
 
+#: Statusword bits beside those of the state, with their names in CiA 402-2; 12 and 13 depend on
+#: the mode, 8, 14 and 15 on the maker.
+_BITS = {
+    4: "voltage enabled",
+    7: "warning",
+    8: "bit 8",
+    9: "remote",
+    10: "target reached",
+    11: "internal limit active",
+    12: "bit 12",
+    13: "bit 13",
+    14: "bit 14",
+    15: "bit 15",
+}
+
+
 def state_of(statusword: int) -> State:
     """The state that a statusword (0x6041) shows."""
     for state in State:
@@ -40,6 +56,13 @@ def state_of(statusword: int) -> State:
         if statusword & mask == value:
             return state
     return State.NOT_READY_TO_SWITCH_ON  # the masks leave no other; a drive starting up shows it
+
+
+def status_text(statusword: int) -> str:
+    """State and bits of a statusword, for people."""
+    bits = [name for bit, name in _BITS.items() if statusword >> bit & 1]
+    said = f": {', '.join(bits)}" if bits else ""
+    return f"{state_of(statusword)} (statusword {statusword:#06x}{said})"
 
 
 _UP = {
@@ -74,3 +97,34 @@ def controlword_up(state: State, previous: int) -> int:
 def controlword_down(state: State) -> int:
     """Next controlword on the way to SWITCH ON DISABLED, from any state, step by step."""
     return _DOWN.get(state, Controlword.DISABLE_VOLTAGE)
+
+
+#: Resets after which a fault that comes back is taken for one that stays.
+_RESETS = 3
+
+
+class Enabling:
+    """The way to OPERATION ENABLED from any state, one statusword and controlword at a time.
+
+    Serves a cycle as well as SDO: whoever has a new statusword asks for the next controlword.
+    """
+
+    def __init__(self) -> None:
+        self._controlword: int = Controlword.DISABLE_VOLTAGE
+        self._resets = 0
+        self._faulty = False
+
+    def next(self, statusword: int) -> int:
+        """Controlword to send now. HALT and every other stale bit are clear in all of them."""
+        state = state_of(statusword)
+        faulty = state is State.FAULT
+        if faulty and not self._faulty:
+            self._resets += 1
+        self._faulty = faulty
+        self._controlword = controlword_up(state, self._controlword)
+        return self._controlword
+
+    @property
+    def in_vain(self) -> bool:
+        """Whether the fault has come back after as many resets as make sense."""
+        return self._resets > _RESETS

@@ -1,11 +1,19 @@
 """From a drive that is found somehow to one that is ready for the cycle: everything over SDO."""
 
+import math
+import time
 from dataclasses import dataclass
 
+from canwall.config import Bus as BusSettings
 from canwall.config import Drive as DriveSettings
 from canwall.drive import objects as od
+from canwall.drive.cia402 import Controlword, State, state_of, status_text
+from canwall.drive.identity import Identity, identify
+from canwall.drive.mode import Mode, select_mode, steepest_slope
 from canwall.drive.node import DriveError, DriveNode
-from canwall.drive.pdo import PdoLayout, configure_rpdo, configure_tpdo
+from canwall.drive.pdo import PdoLayout, configure_rpdo, configure_tpdo, with_constant
+from canwall.drive.scales import Scales, read_scales
+from canwall.drive.watchdog import NO_WATCHDOG, Watchdog, arm
 from canwall.units import DriveUnits
 
 #: Without these objects a drive cannot render a wall, whatever its maker.
@@ -22,94 +30,150 @@ REQUIRED_OBJECTS = (
     od.TARGET_TORQUE,
 )
 
-_MODE_POLLS = 100
+_MEASURED = (od.POSITION_ACTUAL_VALUE, od.STATUSWORD)
+_MEASURED_TOO = (od.TORQUE_ACTUAL_VALUE, od.VELOCITY_ACTUAL_VALUE)
+_COMMANDED = (od.CONTROLWORD, od.TARGET_TORQUE)
+
+_DISABLING_S = 2.0
+_SYNC_CAN_ID = 0x80
+
+#: A watchdog shorter than this many cycles would bite a master that lives.
+_WATCHDOG_CYCLES = 3
+#: In simulated time the master and its drive wait for each other, the drive's timers for nobody: a
+#: machine that has other things to do is no dead master.
+_SIMULATED_WATCHDOG_S = 30.0
 
 
 @dataclass(frozen=True)
 class DriveSetup:
-    """What the cycle needs to know of a drive that is set up."""
+    """What the cycle needs to know of a drive that is set up.
+
+    units: scales at the shaft. sync_cob_id: CAN-ID of the SYNC that the drive consumes.
+    tpdo, rpdo: where statusword, position, torque, controlword and target torque lie in them.
+    watchdog: what the cycle has to send beside the RPDOs, and how often.
+    sync_counter_overflow: 0x1019: from 1 to this counts the SYNC; 0: it carries nothing.
+    synchronous: whether the RPDO's torque waits for the next SYNC.
+    torque_limit_nm: what the drive itself holds the torque to, at the shaft [N·m].
+    scales, mode, identity: as they were found, for people.
+    notes: what the drive would not do and the cycle can live without.
+    """
 
     units: DriveUnits
     sync_cob_id: int
     tpdo: PdoLayout
     rpdo: PdoLayout
-    #: 0x1019: from 1 to this counts the SYNC that the drive wants; 0: it carries nothing.
+    watchdog: Watchdog = NO_WATCHDOG
+    synchronous: bool = True
+    torque_limit_nm: float = math.inf
+    mode: Mode | None = None
+    scales: Scales | None = None
+    identity: Identity | None = None
+    notes: tuple[str, ...] = ()
     sync_counter_overflow: int = 0
 
 
-def set_up(node: DriveNode, settings: DriveSettings) -> DriveSetup:
-    """Cyclic synchronous torque, zero torque, PDOs on the SYNC; ends in NMT OPERATIONAL.
+def set_up(
+    node: DriveNode, settings: DriveSettings, bus: BusSettings, real_time: bool
+) -> DriveSetup:
+    """Torque mode, zero torque, PDOs on the SYNC, watchdog; ends in NMT OPERATIONAL.
 
-    Nothing is enabled and nothing is stored in the drive. Raises DriveError, and ConfigError's
-    kin ValueError where the configuration has to supply what the drive cannot say.
+    Nothing is enabled and nothing is stored in the drive; `node.restore` undoes it. Raises
+    DriveError, that names the key where the configuration has to supply what the drive cannot say.
     """
     node.wait_until_present(settings.wait_s)
     node.command("PRE-OPERATIONAL")
-    units = read_units(node, settings)
-    _select_torque_mode(node)
-    node.write_confirmed(od.TARGET_TORQUE, 0, 0)
-    measured = [od.POSITION_ACTUAL_VALUE, od.STATUSWORD]
-    if node.has(od.TORQUE_ACTUAL_VALUE):
-        measured.append(od.TORQUE_ACTUAL_VALUE)
-    tpdo = configure_tpdo(node, 1, measured)
-    rpdo = configure_rpdo(node, 1, [od.CONTROLWORD, od.TARGET_TORQUE])
-    sync = node.read(od.SYNC_COB_ID) & 0x7FF if node.has(od.SYNC_COB_ID) else 0x80
-    overflow = node.read(od.SYNC_COUNTER_OVERFLOW) if node.has(od.SYNC_COUNTER_OVERFLOW) else 0
+    identity = identify(node)
+    disable(node)
+    notes = list(identity.doubts)
+    _write_parameters(node, settings)
+    scales = read_scales(node, settings)
+    mode = select_mode(node, settings.mode)
+    if mode.number == od.PROFILE_TORQUE and node.has(od.TORQUE_SLOPE):
+        steepest_slope(node)
+    node.write(od.TARGET_TORQUE, 0, 0)
+    node.confirm(od.TARGET_TORQUE, 0, 0)
+    _set_interpolation_period(node, bus.cycle_s, notes)
+    immediate = settings.torque_pdo == "immediate"
+    tpdo = configure_tpdo(node, _MEASURED, _MEASURED_TOO, notes)
+    rpdo = configure_rpdo(node, _COMMANDED, immediate, notes)
+    rpdo = with_constant(node, rpdo, _COMMANDED)
+    watchdog_s = settings.watchdog_s if real_time else _SIMULATED_WATCHDOG_S
+    watchdog = arm(
+        node,
+        rpdo,
+        max(watchdog_s, _WATCHDOG_CYCLES * bus.cycle_s),
+        bus.master_id,
+        settings.accept_no_watchdog,
+    )
+    sync = node.read(od.SYNC_COB_ID) & 0x7FF if node.has(od.SYNC_COB_ID) else _SYNC_CAN_ID
     node.command("OPERATIONAL")
-    return DriveSetup(units, sync, tpdo, rpdo, overflow)
+    return DriveSetup(
+        scales.units,
+        sync,
+        tpdo,
+        rpdo,
+        watchdog,
+        not immediate,
+        scales.torque_limit_nm,
+        mode,
+        scales,
+        identity,
+        tuple(notes),
+        node.read(od.SYNC_COUNTER_OVERFLOW) if node.has(od.SYNC_COUNTER_OVERFLOW) else 0,
+    )
 
 
-def read_units(node: DriveNode, settings: DriveSettings) -> DriveUnits:
-    """Scales from 0x608F, 0x6091 and 0x6076; what `[drive]` gives goes first.
+def disable(node: DriveNode) -> None:
+    """Take the torque away, and HALT and whatever else a predecessor has left in 0x6040.
 
-    Raises DriveError that names the key which would settle it.
+    From any state; a fault stays, its reset belongs to enabling. Raises DriveError.
     """
-    gear = settings.gear_ratio
-    if gear is None:
-        gear = 1.0
-        if node.has(od.GEAR_RATIO, 1):
-            gear = _quotient(node, od.GEAR_RATIO)
-    if settings.counts_per_rev is not None:
-        counts = settings.counts_per_rev
-    elif node.has(od.POSITION_ENCODER_RESOLUTION, 1):
-        counts = _quotient(node, od.POSITION_ENCODER_RESOLUTION)
-    else:
-        raise DriveError(
-            "the drive has no 0x608F: give drive.counts_per_rev (increments per turn of the motor)"
-        )
-    if settings.rated_torque_nm is not None:
-        rated = settings.rated_torque_nm
-    elif node.has(od.MOTOR_RATED_TORQUE):
-        rated = node.read(od.MOTOR_RATED_TORQUE) / 1000.0
-    else:
-        raise DriveError("the drive has no 0x6076: give drive.rated_torque_nm")
-    try:
-        return DriveUnits.behind_gear(counts, rated, gear)
-    except ValueError as error:
-        raise DriveError(f"node {node.node_id}: {error}; correct it in [drive]") from None
-
-
-def _quotient(node: DriveNode, index: int) -> float:
-    numerator, denominator = node.read(index, 1), node.read(index, 2)
-    if numerator <= 0 or denominator <= 0:
-        raise DriveError(
-            f"node {node.node_id}, 0x{index:04X}: {numerator}/{denominator} is no scale"
-        )
-    return numerator / denominator
-
-
-def _select_torque_mode(node: DriveNode) -> None:
-    mode = od.CYCLIC_SYNCHRONOUS_TORQUE
-    if node.has(od.SUPPORTED_DRIVE_MODES):
-        supported = node.read(od.SUPPORTED_DRIVE_MODES)
-        if not supported >> (mode - 1) & 1:
-            raise DriveError(
-                f"node {node.node_id}: 0x6502 = {supported:#x}: no cyclic synchronous torque mode"
-            )
-    node.write(od.MODES_OF_OPERATION, 0, mode)
-    # The display follows when the drive has switched, which may take it a while.
-    for _ in range(_MODE_POLLS):
-        if node.read(od.MODES_OF_OPERATION_DISPLAY) == mode:
+    deadline = time.monotonic() + _DISABLING_S
+    node.write(od.CONTROLWORD, 0, Controlword.DISABLE_VOLTAGE)
+    while True:
+        statusword = node.read(od.STATUSWORD)
+        if state_of(statusword) in (State.SWITCH_ON_DISABLED, State.FAULT):
             return
-    shown = node.read(od.MODES_OF_OPERATION_DISPLAY)
-    raise DriveError(f"node {node.node_id}: 0x6061 shows mode {shown} after mode {mode} was set")
+        if time.monotonic() >= deadline:
+            raise DriveError(
+                f"node {node.node_id} stays in {status_text(statusword)} after DISABLE VOLTAGE"
+            )
+
+
+def _write_parameters(node: DriveNode, settings: DriveSettings) -> None:
+    """What the DCF and `[drive] parameters` want, in this order."""
+    if settings.download_dcf:
+        _download_dcf(node)
+    for (index, subindex), value in settings.written.items():
+        node.set(index, subindex, value)
+
+
+def _download_dcf(node: DriveNode) -> None:
+    """Every ParameterValue of the DCF but those of the PDOs, which are set up for the wall.
+
+    Raises DriveError.
+    """
+    for variable in node.configured():
+        if variable.index >= od.RPDO_COMMUNICATION and variable.index < 0x1C00:
+            continue
+        if variable.index in _COMMANDED or "w" not in variable.access_type:
+            continue
+        node.change(variable.index, variable.subindex, variable.value)
+
+
+def _set_interpolation_period(node: DriveNode, cycle_s: float, notes: list[str]) -> None:
+    """0x60C2: how often a new torque comes, for drives that watch over it or interpolate."""
+    if not node.has(od.INTERPOLATION_TIME_PERIOD, 2):
+        return
+    for exponent in (-3, -4, -5, -6):
+        units = cycle_s / 10.0**exponent
+        if round(units) <= 0xFF and math.isclose(units, round(units), rel_tol=1e-9):
+            break
+    else:
+        notes.append(f"0x60C2 cannot hold a cycle of {cycle_s:g} s; it stays as it is")
+        return
+    try:
+        node.set(od.INTERPOLATION_TIME_PERIOD, 2, exponent)
+        node.set(od.INTERPOLATION_TIME_PERIOD, 1, round(units))
+    except DriveError as error:
+        notes.append(f"0x60C2 stays as it is: {error}")

@@ -1,9 +1,12 @@
 """A simulated drive from `[drive]` (its dictionary) and `[simulation]` (its mechanics)."""
 
+import math
+
 from canwall.config import Drive as DriveSettings
 from canwall.config import Simulation
 from canwall.simdrive.dictionary import Dictionary
 from canwall.simdrive.drive import DEFAULT_BITRATE, SimulatedDrive
+from canwall.simdrive.hardware import Hardware
 from canwall.simdrive.memory import UNCONFIGURED, Memory
 from canwall.simdrive.motion import ServoMotion
 
@@ -27,8 +30,10 @@ def make_drive(
     dictionary.supply(0x608F, 1, simulation.counts_per_rev)
     for unit in ((0x608F, 2), (0x6091, 1), (0x6091, 2)):
         dictionary.supply(*unit, 1)
-    counts = _quotient(dictionary, 0x608F) * _quotient(dictionary, 0x6091)
+    gear_ratio = _quotient(dictionary, 0x6091)
+    counts = _quotient(dictionary, 0x608F) * gear_ratio
     motion = ServoMotion(simulation, sync_period_s, counts)
+    hardware = _hardware(simulation, counts / (2.0 * math.pi), gear_ratio)
     return SimulatedDrive(
         dictionary,
         node_id,
@@ -38,6 +43,22 @@ def make_drive(
         bitrate,
         simulation.torque_delay_cycles,
         simulation.real_time,
+        hardware,
+    )
+
+
+def _hardware(simulation: Simulation, counts_per_rad: float, gear_ratio: float) -> Hardware:
+    switches, home = simulation.limit_switches_rad, simulation.home_switch_rad
+    return Hardware(
+        counts_per_rad=counts_per_rad,
+        gear_ratio=gear_ratio,
+        inertia_kg_m2=simulation.inertia_kg_m2,
+        peak_torque_nm=simulation.peak_torque_nm,
+        overload_s=simulation.overload_s,
+        dc_link_v=simulation.dc_link_v,
+        negative_limit=switches and switches[0] * counts_per_rad,
+        positive_limit=switches and switches[1] * counts_per_rad,
+        home=home and (home[0] * counts_per_rad, home[1] * counts_per_rad),
     )
 
 

@@ -12,6 +12,7 @@ from canwall.simdrive.emcy import COMMUNICATION, HEARTBEAT_LOST, EmergencyProduc
 from canwall.simdrive.error_behaviour import ErrorBehaviour
 from canwall.simdrive.frame import NS_PER_MS, Clock, Frame
 from canwall.simdrive.guarding import NodeGuarding
+from canwall.simdrive.hardware import Hardware
 from canwall.simdrive.heartbeat import HeartbeatConsumer, HeartbeatProducer
 from canwall.simdrive.lss import LssSlave
 from canwall.simdrive.memory import UNCONFIGURED, Memory
@@ -29,6 +30,8 @@ DEFAULT_BITRATE = 1_000_000
 """Bit/s."""
 
 _ABORT_CONNECTION = (0x6007, 0)
+_SYNC_GONE_S = 0.1
+_LONGEST_TICK_S = 0.01
 
 
 class SimulatedDrive:
@@ -51,6 +54,7 @@ class SimulatedDrive:
         bitrate: int = DEFAULT_BITRATE,
         torque_delay_cycles: float = 0.0,
         real_time: bool = False,
+        hardware: Hardware | None = None,
     ) -> None:
         """Build the drive; it is dead until ``boot``.
 
@@ -64,6 +68,7 @@ class SimulatedDrive:
             torque_delay_cycles: from the torque that a PDO brings to its effect, in SYNC periods,
                 beyond what the transmission type of the PDO makes of it.
             real_time: the physics move by the time that ``tick`` tells.
+            hardware: what the dictionary does not say of the drive; None: the usual.
 
         Raises:
             DictionaryError: the dictionary has what no drive can be built from.
@@ -86,6 +91,9 @@ class SimulatedDrive:
         self._sync_is_time = False
         self._passed_s = 0.0
         """Time that the slope of the torque (0x6087) has not been told of."""
+        self._without_sync_s = 0.0
+        """Time since the last SYNC, or since then and a slow-down going on without it."""
+        self._hardware = hardware or Hardware()
         self._build(dictionary, node_id)
 
     def _build(self, dictionary: Dictionary, node_id: int) -> None:
@@ -98,7 +106,7 @@ class SimulatedDrive:
         send = self._outbox.append
         self._emcy = EmergencyProducer(dictionary, send)
         self._store = ParameterStore(dictionary, self._memory)
-        self._axis = Axis(dictionary, self._motion, self._emcy)
+        self._axis = Axis(dictionary, self._motion, self._emcy, self._hardware, self._sync_period_s)
         self._sync = SyncConsumer(
             dictionary, self._clock, self._emcy, self._route, self._connection_lost
         )
@@ -172,6 +180,8 @@ class SimulatedDrive:
         if self.real_time:
             self._pass(dt / self._sync_period_s)
             self._apply_torque()
+        elif self._axis.slowing_down:
+            self._go_on_without_sync(dt)
         if self._nmt.state is not NmtState.INITIALISATION:
             self._axis.state_machine.step()
             self._heartbeat_producer.tick(self._nmt.state)
@@ -237,7 +247,7 @@ class SimulatedDrive:
     def _pass(self, periods: float) -> None:
         """Let time pass for the physics, under the torque that has held until now."""
         actuator = self._actuator
-        if actuator.delayed and not self._axis.state_machine.powered:
+        if actuator.delayed and self._axis.motor_free:
             actuator.cut()
         actuator.advance(self._axis.torque_nm, periods)
         self._passed_s += periods * self._sync_period_s
@@ -249,7 +259,21 @@ class SimulatedDrive:
         if not self._actuator.direct:
             self._axis.show_torque(self._actuator.torque_nm(self._axis.torque_nm))
 
+    def _go_on_without_sync(self, dt: float) -> None:
+        """Let a drive come to rest whose SYNC, and so its master, has gone.
+
+        A tick counts for a few milliseconds at the most: where the program itself was held up,
+        the SYNC may be waiting.
+        """
+        self._without_sync_s += min(dt, _LONGEST_TICK_S)
+        while self._without_sync_s > _SYNC_GONE_S + self._sync_period_s:
+            self._without_sync_s -= self._sync_period_s
+            self._pass(1.0)
+            self._apply_torque()
+            self._axis.sample()
+
     def _on_sync(self, data: bytes) -> None:
+        self._without_sync_s = 0.0
         if self._sync_is_time:
             self._pass(1.0)
         elif not self.real_time:

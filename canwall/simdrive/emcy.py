@@ -13,17 +13,20 @@ from canwall.simdrive.cob_id import (
 from canwall.simdrive.dictionary import Dictionary, Key
 from canwall.simdrive.frame import Send
 
+DC_LINK_UNDERVOLTAGE = 0x3220
 COMMUNICATION = 0x8100
 HEARTBEAT_LOST = 0x8130
 PDO_TOO_SHORT = 0x8210
 SYNC_LENGTH = 0x8240
 RPDO_TIMEOUT = 0x8250
 SYNC_LOST = 0x8700
+EXTERNAL_ERROR = 0x9000
 
 _NO_ERROR = 0x0000
 _GENERIC = 0x01
-_REGISTER_BITS = {0x8: 0x10}
-"""Bit of 0x1001 by the first digit of the error code: 8 is monitoring, communication."""
+_REGISTER_BITS = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08, 0x8: 0x10, 0xF: 0x80}
+"""Bit of 0x1001 by the first digit of the error code: current, voltage, temperature, monitoring
+(communication), manufacturer's."""
 
 # Error code, error register, and in the manufacturer's bytes the object that watches.
 _MESSAGE = Struct("<HBHBxx")

@@ -3,7 +3,9 @@
 from collections.abc import Callable
 from enum import Enum
 
-from canwall.simdrive.dictionary import Dictionary, Entry
+from canwall.simdrive import option_codes
+from canwall.simdrive.dictionary import Dictionary
+from canwall.simdrive.option_codes import OptionCode, Ramp
 
 
 class State(Enum):
@@ -31,17 +33,6 @@ class Command(Enum):
 
 FAULT_RESET = 0x80
 
-QUICK_STOP_DISABLE = 0
-QUICK_STOP_STAY = 6
-_OPTIONS = {
-    0x605A: (2, (QUICK_STOP_DISABLE, 2, QUICK_STOP_STAY)),
-    0x605B: (0, (0, 1)),
-    0x605C: (1, (0, 1)),
-    0x605E: (2, (0, 1, 2)),
-}
-"""Option codes: default of CiA 402 and the values served. A ramp in torque mode is torque zero
-at once, so 0x605B and 0x605C come out the same with and without one."""
-
 _TRANSITIONS = {
     State.SWITCH_ON_DISABLED: {
         Command.SHUTDOWN: State.READY_TO_SWITCH_ON,  # 2
@@ -63,6 +54,7 @@ _TRANSITIONS = {
         Command.QUICK_STOP: State.QUICK_STOP_ACTIVE,  # 11
         Command.SHUTDOWN: State.READY_TO_SWITCH_ON,  # 8
         Command.SWITCH_ON: State.SWITCHED_ON,  # 5
+        Command.ENABLE_OPERATION: State.OPERATION_ENABLED,  # takes a slow-down back
     },
     State.QUICK_STOP_ACTIVE: {
         Command.DISABLE_VOLTAGE: State.SWITCH_ON_DISABLED,  # 12
@@ -85,16 +77,45 @@ def decode(controlword: int) -> Command | None:
 
 
 class StateMachine:
-    """Takes controlwords and faults; tells its owner of every change of state."""
+    """Takes controlwords and faults; tells its owner of every change.
 
-    def __init__(self, dictionary: Dictionary, changed: Callable[[], None]) -> None:
-        """Args: dictionary: has the option codes; changed: called after each change of state."""
+    A transition that ends the operation waits for the slow-down that its option code asks for
+    (``ramp``); its owner carries that out and says when the drive is at rest.
+    """
+
+    def __init__(
+        self,
+        dictionary: Dictionary,
+        changed: Callable[[], None],
+        at_rest: Callable[[], bool],
+    ) -> None:
+        """Begin in NOT READY TO SWITCH ON.
+
+        Args:
+            dictionary: has the option codes.
+            changed: called after each change of the state or of the ramp.
+            at_rest: whether the slow-down under way is done.
+
+        Raises:
+            DictionaryError: an option code is of no use.
+        """
         self.state = State.NOT_READY_TO_SWITCH_ON
+        self.ramp: Ramp | None = None
+        """How the drive is to slow down, None: it is not to."""
+        self.voltage = True
+        """Whether the DC link is up: without, nothing is switched on (transition 3)."""
+        self.fault_present = False
+        """Whether what led to the fault is still there: it cannot be reset (transition 15)."""
         self._changed = changed
+        self._at_rest = at_rest
+        self._following: State | None = None
         self._last_controlword = 0
-        options = {index: _option(dictionary, index) for index in _OPTIONS}
-        self._quick_stop_option = options[0x605A]
-        self._fault_reaction_option = options[0x605E]
+        self._quick_stop = OptionCode(dictionary, option_codes.QUICK_STOP)
+        self._fault_reaction = OptionCode(dictionary, option_codes.FAULT_REACTION)
+        self._leaving = {
+            Command.SHUTDOWN: OptionCode(dictionary, option_codes.SHUTDOWN),
+            Command.SWITCH_ON: OptionCode(dictionary, option_codes.DISABLE_OPERATION),
+        }
 
     @property
     def powered(self) -> bool:
@@ -105,6 +126,11 @@ class StateMachine:
     def faulty(self) -> bool:
         """Whether the drive is in FAULT, or about to be."""
         return self.state in (State.FAULT_REACTION_ACTIVE, State.FAULT)
+
+    @property
+    def stays(self) -> bool:
+        """Whether the drive is to stay in QUICK STOP ACTIVE (0x605A = 5 to 7)."""
+        return self.state is State.QUICK_STOP_ACTIVE and self._following is None
 
     def reset(self) -> None:
         """Transition 0: power-on or reset of the node."""
@@ -119,43 +145,69 @@ class StateMachine:
             command = decode(controlword)
             if command is not None:
                 self.command(command)
-        elif fault_reset:
+        elif fault_reset and not self.fault_present:
             self._enter(State.SWITCH_ON_DISABLED)  # 15
 
     def command(self, command: Command) -> None:
         """Carry out one command, if the present state has a transition for it."""
         target = _TRANSITIONS.get(self.state, {}).get(command)
-        option = self._quick_stop_option.value
-        if target is State.QUICK_STOP_ACTIVE and option == QUICK_STOP_DISABLE:
-            target = State.SWITCH_ON_DISABLED
-        elif self.state is State.QUICK_STOP_ACTIVE and command is Command.ENABLE_OPERATION:
-            target = target if option == QUICK_STOP_STAY else None
-        if target is not None:
+        if target is None:
+            return
+        if self.state is State.OPERATION_ENABLED:
+            self._end_operation(command, target)
+        elif self._ready_for(target):
             self._enter(target)
 
-    def fault(self) -> None:
-        """Transition 13, from every state; with 0x605E = 0 there is no reaction to wait for."""
-        if not self.faulty:
-            reacting = self._fault_reaction_option.value != 0
-            self._enter(State.FAULT_REACTION_ACTIVE if reacting else State.FAULT)
+    def _ready_for(self, target: State) -> bool:
+        """Whether a transition that switches something on may be taken."""
+        if self.state is State.READY_TO_SWITCH_ON and target is not State.SWITCH_ON_DISABLED:
+            return self.voltage  # 3
+        if self.state is State.QUICK_STOP_ACTIVE and target is State.OPERATION_ENABLED:
+            return self._quick_stop.stays and self._at_rest()  # 16
+        return True
+
+    def _end_operation(self, command: Command, target: State) -> None:
+        if target is State.QUICK_STOP_ACTIVE:
+            if self._quick_stop.disables:
+                self._enter(State.SWITCH_ON_DISABLED)
+            else:
+                following = None if self._quick_stop.stays else State.SWITCH_ON_DISABLED
+                self._enter(target, self._quick_stop.ramp, following)
+        elif command in self._leaving:
+            if self._following is not target:
+                self._enter(self.state, self._leaving[command].ramp, target)
+                if self._following is target and self._at_rest():
+                    self._enter(target)
+        elif target is not self.state or self._following is not None:
+            self._enter(target)
+
+    def fault(self, *, coasting: bool = False) -> None:
+        """Transition 13, from every state; what 0x605E = 0 or nothing to brake ends in FAULT.
+
+        Args:
+            coasting: there is no torque to brake with.
+        """
+        if self.state is State.FAULT_REACTION_ACTIVE:
+            if coasting:
+                self._enter(self.state, Ramp.MOTOR_FREE, State.FAULT)
+        elif self._fault_reaction.disables:
+            self._enter(State.FAULT)
+        elif self.state is not State.FAULT:
+            braking = self.powered and not coasting
+            ramp = self._fault_reaction.ramp if braking else Ramp.MOTOR_FREE
+            self._enter(State.FAULT_REACTION_ACTIVE, ramp, State.FAULT)
 
     def step(self) -> None:
         """Take the automatic transition that is due: what the drive had to do is done."""
         if self.state is State.NOT_READY_TO_SWITCH_ON:
             self._enter(State.SWITCH_ON_DISABLED)  # 1
-        elif self.state is State.FAULT_REACTION_ACTIVE:
-            self._enter(State.FAULT)  # 14
-        elif (
-            self.state is State.QUICK_STOP_ACTIVE
-            and self._quick_stop_option.value != QUICK_STOP_STAY
-        ):
-            self._enter(State.SWITCH_ON_DISABLED)  # 12
+        elif self._following is not None and self._at_rest():
+            self._enter(self._following)  # 5, 8, 12, 14
 
-    def _enter(self, state: State) -> None:
+    def _enter(
+        self, state: State, ramp: Ramp | None = None, following: State | None = None
+    ) -> None:
         self.state = state
+        self.ramp = ramp
+        self._following = following
         self._changed()
-
-
-def _option(dictionary: Dictionary, index: int) -> Entry:
-    default, served = _OPTIONS[index]
-    return dictionary.number(index, absent=default).allow(served)

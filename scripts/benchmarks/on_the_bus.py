@@ -135,7 +135,7 @@ def _ready() -> Iterator[_Ready]:
         link = Link(bus, idle=runner.poll)
         dictionary = load_eds(settings.drive.eds, node_id, REQUIRED_OBJECTS)
         node = DriveNode(link, node_id, dictionary)
-        setup = set_up(node, settings.drive)
+        setup = set_up(node, settings.drive, settings.bus, settings.real_time)
         for controlword in (0x06, 0x07, _ENABLE_OPERATION):
             node.write(0x6040, 0, controlword)
         axis = Axis(node, setup, settings, run_laws(settings), Ring.create())

@@ -198,6 +198,7 @@ def test_drive_that_falls_silent_while_it_is_enabled(make_rig: RigFactory) -> No
 def test_drive_in_fault_is_reset(make_rig: RigFactory) -> None:
     loop = Loop(make_rig(pressing()))
     node = loop.rig.node
+    node.write(0x6007, 0, 1)  # what aborts the connection is a fault
     for word in (0x06, 0x07, 0x0F):
         node.write(0x6040, 0, word)
     node.command("PRE-OPERATIONAL")
@@ -242,6 +243,7 @@ def test_drive_that_another_master_disables(make_rig: RigFactory) -> None:
 
 def test_drive_in_fault_is_named_with_its_emergency(make_rig: RigFactory) -> None:
     loop = Loop(make_rig(pressing()))
+    loop.rig.node.write(0x6007, 0, 1)
     loop.rig.node.write(0x1016, 1, 0x7F0001)  # misses the heartbeat of node 127 after 1 ms
     trip = trip_of(loop, lambda j: loop.rig.inject(0x77F, b"\x05"))
     assert trip.endswith("EMCY 0x8130 (Monitoring), register 0x11")

@@ -78,6 +78,7 @@ def bring_into(rig: Rig, name: str) -> None:
 def test_up_from_every_state(make_rig: RigFactory, name: str) -> None:
     rig = make_rig()
     rig.set_up()
+    rig.node.write(0x6007, 0, 1)  # what aborts the connection is a fault
     bring_into(rig, name)
     sent: list[int] = []
     previous = 0x0F  # the master knows nothing of what others sent

@@ -42,7 +42,7 @@ def test_late_answer_after_the_request(make_rig: RigFactory) -> None:
 
     rig.tampering.process = late  # type: ignore[method-assign]
     assert rig.node.read(0x1000) == 0x20192
-    rig.node.write_confirmed(0x6071, 0, -5)
+    rig.node.set(0x6071, 0, -5)
 
 
 def test_other_frames_do_not_disturb(rig: Rig) -> None:

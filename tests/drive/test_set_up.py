@@ -47,14 +47,19 @@ def rig(make_rig: RigFactory) -> Rig:
 
 
 @pytest.mark.parametrize(
-    ("communication", "cob_id", "mapping"),
+    ("communication", "cob_id", "mapping", "watchdog"),
     [
-        (0x1800, BIT_30 | 0x185, [0x60640020, 0x60410010, 0x60770010]),
-        (0x1400, 0x205, [0x60400010, 0x60710010]),
+        (0x1800, BIT_30 | 0x185, [0x60640020, 0x60410010, 0x60770010], []),
+        # Switched off once more for its deadline.
+        (0x1400, 0x205, [0x60400010, 0x60710010], [(1, INVALID | 0x205), (5, 30000), (1, 0x205)]),
     ],
 )
 def test_pdo_is_configured_in_the_order_of_cia_301(
-    rig: Rig, communication: int, cob_id: int, mapping: list[int]
+    rig: Rig,
+    communication: int,
+    cob_id: int,
+    mapping: list[int],
+    watchdog: list[tuple[int, int]],
 ) -> None:
     rig.set_up()
     objects = communication + 0x200
@@ -65,6 +70,7 @@ def test_pdo_is_configured_in_the_order_of_cia_301(
         (objects, 0, len(mapping)),
         (communication, 2, 1),
         (communication, 1, cob_id),
+        *((communication, *write) for write in watchdog),
     ]
     assert rig.node.read(communication, 1) == cob_id
     assert [rig.node.read(objects, place) for place in (1, 2)] == mapping[:2]
@@ -197,11 +203,6 @@ def test_drive_that_falls_silent(rig: Rig) -> None:
     rig.tampering.mute.add(SDO_ANSWER)
     with pytest.raises(DriveError, match="node 5: reading 0x6041:00 failed: No SDO response"):
         rig.node.read(0x6041)
-
-
-def test_mode_that_is_not_supported(rig: Rig) -> None:
-    rig.tampering.lies[(0x6502, 0)] = 0x8
-    assert "0x6502 = 0x8: no cyclic synchronous torque" in error_of(rig)
 
 
 def test_mode_that_does_not_come(rig: Rig) -> None:

@@ -92,10 +92,10 @@ def test_cases_reach_every_state() -> None:
 @pytest.mark.parametrize(
     ("index", "served"),
     [
-        (0x605A, {0, 2, 6}),
+        (0x605A, {0, 1, 2, 3, 5, 6, 7}),
         (0x605B, {0, 1}),
         (0x605C, {0, 1}),
-        (0x605E, {0, 1, 2}),
+        (0x605E, {0, 1, 2, 3}),
         (0x6007, {0, 1, 2, 3}),
     ],
 )

@@ -56,12 +56,17 @@ def test_limit(ramping: Bench) -> None:
     assert [status & LIMITED for status, _, _ in cycles] == [0, LIMITED]
 
 
-def test_torque_begins_at_zero_again(ramping: Bench) -> None:
+def test_operation_ends_when_the_torque_is_gone_and_begins_at_zero_again(ramping: Bench) -> None:
     ramping.command(0x0F, 20)
     ramping.cycle()
     ramping.cycle()
     ramping.command(0x07, 20)
-    assert ramping.cycle() == (0x0233, 1014, 0)
+    cycles = [ramping.cycle() for _ in range(3)]
+    assert [(status, torque) for status, _, torque in cycles] == [
+        (OPERATION_ENABLED, 10),
+        (OPERATION_ENABLED, 0),
+        (0x0233, 0),
+    ]
     ramping.command(0x0F, 20)
     assert ramping.cycle()[2] == 10
 

@@ -55,6 +55,8 @@ SERVED: dict[int, set[AbortCode]] = {
     0x605D: {INVALID},
     0x605E: {INVALID},
     0x6060: {INVALID},
+    0x6098: {INVALID},
+    0x60A9: {INVALID},
 }
 
 

@@ -15,10 +15,10 @@ FOLDER = Path(__file__).parents[3] / "shared" / "vendor-eds"
 
 @dataclass(frozen=True)
 class Vendor:
-    """A file, and what its drive is to be like."""
+    """A file, and what its drive is to be like; each has homing beside its torque modes."""
 
     file: str
-    modes: tuple[int, ...]
+    torque_modes: tuple[int, ...]
     lacks: tuple[int, ...]
     rated_torque_mnm: float
     counts_per_rev: float
@@ -48,10 +48,15 @@ def path_of(file: str) -> Path:
 
 
 class ConfiguredBench(Bench):
-    """A drive as the configuration describes it, with one of the dictionaries."""
+    """A drive as the configuration describes it, with one of the dictionaries.
+
+    Ingenia's begins with a current limit (0x6073) of 4 %, which its user has to raise.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         settings = DriveSettings(node_id=NODE_ID, eds=path)
         self.drive = make_drive(settings, SIMULATION, 0.001)
         self.sent = self.drive.boot()
+        if path.name.startswith("ingenia"):
+            self.write(0x6073, 0, 1000, 2)

@@ -1,0 +1,111 @@
+"""Which torque mode: cyclic synchronous torque, else profile torque, and why."""
+
+import time
+from dataclasses import dataclass
+
+from canwall.drive import objects as od
+from canwall.drive.node import DriveError, DriveNode
+
+_CANDIDATES = {
+    "auto": (od.CYCLIC_SYNCHRONOUS_TORQUE, od.PROFILE_TORQUE),
+    "cst": (od.CYCLIC_SYNCHRONOUS_TORQUE,),
+    "pt": (od.PROFILE_TORQUE,),
+}
+_NAMES = {
+    od.CYCLIC_SYNCHRONOUS_TORQUE: "cyclic synchronous torque",
+    od.PROFILE_TORQUE: "profile torque",
+}
+_SWITCHING_S = 0.5
+
+#: 0x6087 [per mille of the rated torque per second]: the greatest a drive may take, downwards.
+_SLOPES = (0xFFFF_FFFF, 0x7FFF_FFFF, 100_000_000, 10_000_000, 1_000_000)
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A mode of operation (0x6060) that the drive confirmed (0x6061), and why it is this one."""
+
+    number: int
+    why: str
+
+    @property
+    def name(self) -> str:
+        """Its name in CiA 402."""
+        return _NAMES[self.number]
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.number}): {self.why}"
+
+
+def select_mode(node: DriveNode, wanted: str) -> Mode:
+    """Set the best torque mode that the drive has and take its word for it (0x6061).
+
+    wanted: "auto", "cst" or "pt". 0x6502 says which there are; where it names no torque mode
+    (some vendors leave the bits out), or the mode was asked for by name, it is tried. Raises
+    DriveError.
+    """
+    candidates = _CANDIDATES[wanted]
+    said = node.read(od.SUPPORTED_DRIVE_MODES) if node.has(od.SUPPORTED_DRIVE_MODES) else None
+    listed = [mode for mode in _NAMES if said is not None and said >> (mode - 1) & 1]
+    if wanted == "auto" and listed:
+        candidates = tuple(mode for mode in candidates if mode in listed)
+    reasons = []
+    for mode in candidates:
+        if mode == od.PROFILE_TORQUE and mode not in listed and not node.has(od.TORQUE_SLOPE):
+            reasons.append("profile torque needs 0x6087, which the drive does not have")
+            continue
+        try:
+            enter_mode(node, mode)
+        except DriveError as error:
+            reasons.append(str(error))
+            continue
+        return Mode(mode, "; ".join([_evidence(said, mode, listed, wanted), *reasons]))
+    raise DriveError(f"{'; '.join(reasons)}: no torque mode, so this drive cannot render a wall")
+
+
+def _evidence(said: int | None, mode: int, listed: list[int], wanted: str) -> str:
+    if said is None:
+        text = "there is no 0x6502; the drive took the mode when it was tried"
+    elif mode not in listed:
+        lists = "does not list it" if listed else "lists no torque mode"
+        text = f"0x6502 = {said:#x} {lists}, yet the drive took it when it was tried"
+    elif mode == od.PROFILE_TORQUE and od.CYCLIC_SYNCHRONOUS_TORQUE not in listed:
+        text = f"0x6502 = {said:#x} lists it, and not cyclic synchronous torque"
+    else:
+        text = f"0x6502 = {said:#x} lists it"
+    return text if wanted == "auto" else f'drive.mode = "{wanted}"; {text}'
+
+
+def enter_mode(node: DriveNode, mode: int) -> None:
+    """Set 0x6060 and wait until 0x6061 shows it. Raises DriveError."""
+    node.change(od.MODES_OF_OPERATION, 0, mode)
+    # The display follows when the drive has switched, which may take it a while.
+    deadline = time.monotonic() + _SWITCHING_S
+    while True:
+        shown = node.read(od.MODES_OF_OPERATION_DISPLAY)
+        if shown == mode:
+            return
+        if time.monotonic() >= deadline:
+            raise DriveError(
+                f"node {node.node_id}: 0x6061 shows mode {shown} after mode {mode} was set"
+            )
+
+
+def steepest_slope(node: DriveNode) -> int:
+    """Set 0x6087 to the greatest that the drive takes, so that the torque follows at once.
+
+    Returns it [per mille of the rated torque per second]. Raises DriveError.
+    """
+    variable = node.dictionary.get_variable(od.TORQUE_SLOPE, 0)
+    greatest = None if variable is None else variable.max
+    slopes = _SLOPES if greatest is None else (greatest, *(s for s in _SLOPES if s < greatest))
+    refusal: DriveError | None = None
+    for slope in slopes:
+        try:
+            node.set(od.TORQUE_SLOPE, 0, slope)
+        except DriveError as error:
+            refusal = refusal or error
+        else:
+            return slope
+    assert refusal is not None
+    raise refusal

@@ -1,0 +1,142 @@
+"""What one count and one per mille mean: from the drive's own objects, else the configuration."""
+
+import math
+from dataclasses import dataclass
+
+from canwall.config import Drive as DriveSettings
+from canwall.drive import objects as od
+from canwall.drive.node import DriveError, DriveNode
+from canwall.units import DriveUnits
+
+#: Units of 0x60A8 (bits 16 to 23) that are angles, in units per revolution (CiA 303-2).
+_ANGLES = {0x10: 2.0 * math.pi, 0x41: 360.0, 0xB4: 1.0}
+_ANGLE_NAMES = {0x10: "radian", 0x41: "degree", 0xB4: "revolution"}
+#: Increments, and no unit at all, which comes to the same.
+_INCREMENTS = (0xB5, 0x00)
+
+_POSITION_REVERSED = 1 << 7
+
+_GIVE_COUNTS = "give drive.counts_per_rev (increments per turn of the motor)"
+
+
+@dataclass(frozen=True)
+class Scales:
+    """Units of a drive, the torque that it holds itself to, and where each comes from.
+
+    torque_limit_nm: what the drive gives at most, at the shaft [N·m].
+    sources: pairs (what, whence), for people.
+    """
+
+    units: DriveUnits
+    torque_limit_nm: float
+    sources: tuple[tuple[str, str], ...]
+
+
+def read_scales(node: DriveNode, settings: DriveSettings) -> Scales:
+    """Scales from 0x608F, 0x6091, 0x6092, 0x60A8 and 0x6076; what `[drive]` gives goes first.
+
+    Raises DriveError that names the key which would settle it.
+    """
+    _check_polarity(node)
+    gear, gear_source = _gear_ratio(node, settings)
+    counts, counts_source = _counts_per_rev(node, settings, gear)
+    rated, rated_source = _rated_torque(node, settings)
+    try:
+        units = DriveUnits(counts, rated * gear)
+    except ValueError as error:
+        raise DriveError(f"node {node.node_id}: {error}; correct it in [drive]") from None
+    per_mille, limit_source = _torque_limit(node)
+    limit_nm = per_mille * units.nm_per_mille
+    return Scales(
+        units,
+        limit_nm,
+        (
+            (f"{counts:g} counts per turn of the shaft", counts_source),
+            (f"{gear:g} turns of the motor per turn of the shaft", gear_source),
+            (f"{rated:g} N·m rated torque of the motor", rated_source),
+            (f"{limit_nm:g} N·m at most", limit_source),
+        ),
+    )
+
+
+def _gear_ratio(node: DriveNode, settings: DriveSettings) -> tuple[float, str]:
+    if settings.gear_ratio is not None:
+        return settings.gear_ratio, "drive.gear_ratio"
+    if node.has(od.GEAR_RATIO, 1):
+        return _quotient(node, od.GEAR_RATIO), "0x6091"
+    return 1.0, "no 0x6091: taken for no gear"
+
+
+def _counts_per_rev(node: DriveNode, settings: DriveSettings, gear: float) -> tuple[float, str]:
+    """Units of 0x6064 per turn of the shaft (CiA 402-2, factor group)."""
+    if settings.counts_per_rev is not None:
+        return settings.counts_per_rev * gear, "drive.counts_per_rev"
+    if node.has(od.SI_UNIT_POSITION):
+        unit = node.read(od.SI_UNIT_POSITION)
+        code, exponent = unit >> 16 & 0xFF, int.from_bytes([unit >> 24 & 0xFF], signed=True)
+        if code in _ANGLES:
+            return (
+                _ANGLES[code] / 10.0**exponent,
+                f"0x60A8 = {unit:#010x}: {10.0**exponent:g} {_ANGLE_NAMES[code]}",
+            )
+        if code not in _INCREMENTS:
+            raise DriveError(
+                f"node {node.node_id}, 0x60A8 = {unit:#010x}: neither increments nor an angle; "
+                f"{_GIVE_COUNTS}"
+            )
+    # A quotient of one is what a drive shows to which nobody has told its encoder or its feed.
+    if node.has(od.FEED_CONSTANT, 1):
+        feed = _quotient(node, od.FEED_CONSTANT)
+        if feed != 1.0:
+            return feed, "0x6092: units per turn of the shaft"
+    if not node.has(od.POSITION_ENCODER_RESOLUTION, 1):
+        raise DriveError(f"the drive has no 0x608F: {_GIVE_COUNTS}")
+    counts = _quotient(node, od.POSITION_ENCODER_RESOLUTION)
+    if counts == 1.0:
+        raise DriveError(f"node {node.node_id}, 0x608F: 1/1 is no encoder; {_GIVE_COUNTS}")
+    return counts * gear, "0x608F" + (" and the gear" if gear != 1.0 else "")
+
+
+def _rated_torque(node: DriveNode, settings: DriveSettings) -> tuple[float, str]:
+    if settings.rated_torque_nm is not None:
+        return settings.rated_torque_nm, "drive.rated_torque_nm"
+    if node.has(od.MOTOR_RATED_TORQUE):
+        return node.read(od.MOTOR_RATED_TORQUE) / 1000.0, "0x6076, in mN·m"
+    raise DriveError("the drive has no 0x6076: give drive.rated_torque_nm")
+
+
+def _torque_limit(node: DriveNode) -> tuple[float, str]:
+    """Per mille that 0x6072, 0x60E0 and 0x60E1 leave, and which of them is the lowest."""
+    indices = (od.MAX_TORQUE, od.POSITIVE_TORQUE_LIMIT, od.NEGATIVE_TORQUE_LIMIT)
+    limits = {index: node.read(index) for index in indices if node.has(index)}
+    if not limits:
+        return math.inf, "the drive has no 0x6072"
+    index = min(limits, key=lambda i: limits[i])
+    if limits[index] == 0:
+        raise DriveError(
+            f"node {node.node_id}, 0x{index:04X} = 0: the drive gives no torque; raise it at the "
+            f'drive, or for the run by drive.parameters = {{ "0x{index:04X}" = 1000 }}'
+        )
+    return float(limits[index]), f"0x{index:04X} = {limits[index]}"
+
+
+def _check_polarity(node: DriveNode) -> None:
+    """0x607E turns the position, not the torque: the wall would pull where it has to push."""
+    if not node.has(od.POLARITY):
+        return
+    polarity = node.read(od.POLARITY)
+    if polarity & _POSITION_REVERSED:
+        raise DriveError(
+            f"node {node.node_id}, 0x607E = {polarity:#04x} turns the position against the torque: "
+            f"clear it at the drive, or for the run by drive.parameters = "
+            f'{{ "0x607E" = 0 }}, and use wall.side'
+        )
+
+
+def _quotient(node: DriveNode, index: int) -> float:
+    numerator, denominator = node.read(index, 1), node.read(index, 2)
+    if numerator <= 0 or denominator <= 0:
+        raise DriveError(
+            f"node {node.node_id}, 0x{index:04X}: {numerator}/{denominator} is no scale"
+        )
+    return numerator / denominator
