@@ -1,4 +1,4 @@
-"""Signs of life for the drives' watchdogs, sent from within the cycle: a loop that hangs is dead."""
+"""Signs of life for the watchdogs of the drives, sent by the cycle: a loop that hangs is dead."""
 
 import time
 from collections.abc import Iterable
