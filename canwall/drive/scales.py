@@ -54,7 +54,10 @@ def read_scales(node: DriveNode, settings: DriveSettings) -> Scales:
             (f"{counts:g} counts per turn of the shaft", counts_source),
             (f"{gear:g} turns of the motor per turn of the shaft", gear_source),
             (f"{rated:g} N·m rated torque of the motor", rated_source),
-            (f"{limit_nm:g} N·m at most", limit_source),
+            (
+                f"{limit_nm:g} N·m at most" if math.isfinite(limit_nm) else "no torque limit",
+                limit_source,
+            ),
         ),
     )
 
@@ -106,8 +109,11 @@ def _rated_torque(node: DriveNode, settings: DriveSettings) -> tuple[float, str]
 
 
 def _torque_limit(node: DriveNode) -> tuple[float, str]:
-    """Per mille that 0x6072, 0x60E0 and 0x60E1 leave, and which of them is the lowest."""
-    indices = (od.MAX_TORQUE, od.POSITIVE_TORQUE_LIMIT, od.NEGATIVE_TORQUE_LIMIT)
+    """Per mille that 0x6072, 0x6073, 0x60E0 and 0x60E1 leave, and which of them is the lowest.
+
+    0x6073 is in per mille of the rated current, which gives the rated torque.
+    """
+    indices = (od.MAX_TORQUE, od.MAX_CURRENT, od.POSITIVE_TORQUE_LIMIT, od.NEGATIVE_TORQUE_LIMIT)
     limits = {index: node.read(index) for index in indices if node.has(index)}
     if not limits:
         return math.inf, "the drive has no 0x6072"
