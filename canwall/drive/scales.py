@@ -14,7 +14,8 @@ _ANGLE_NAMES = {0x10: "radian", 0x41: "degree", 0xB4: "revolution"}
 #: Increments, and no unit at all, which comes to the same.
 _INCREMENTS = (0xB5, 0x00)
 
-_POSITION_REVERSED = 1 << 7
+#: Bits of 0x607E: position, and (where a maker has it) torque.
+_REVERSED = 1 << 7 | 1 << 5
 
 _GIVE_COUNTS = "give drive.counts_per_rev (increments per turn of the motor)"
 
@@ -127,13 +128,13 @@ def _torque_limit(node: DriveNode) -> tuple[float, str]:
 
 
 def _check_polarity(node: DriveNode) -> None:
-    """0x607E turns the position, not the torque: the wall would pull where it has to push."""
+    """Position and torque turned against one another make the wall pull where it has to push."""
     if not node.has(od.POLARITY):
         return
     polarity = node.read(od.POLARITY)
-    if polarity & _POSITION_REVERSED:
+    if polarity & _REVERSED:
         raise DriveError(
-            f"node {node.node_id}, 0x607E = {polarity:#04x} turns the position against the torque: "
+            f"node {node.node_id}, 0x607E = {polarity:#04x} may turn the position against the torque: "
             f"clear it at the drive, or for the run by drive.parameters = "
             f'{{ "0x607E" = 0 }}, and use wall.side'
         )
