@@ -35,7 +35,11 @@ class DriveNode:
 
     def has(self, index: int, subindex: int = 0) -> bool:
         """Whether the object dictionary lists this object."""
-        return self.dictionary.get_variable(index, subindex) is not None
+        item = self.dictionary.get(index)
+        if item is None or isinstance(item, ODVariable):
+            return item is not None and subindex == 0
+        # Asked by [], an array of canopen's makes up the sub-indices that it does not have.
+        return subindex in item.subindices
 
     def configured(self) -> Iterator[ODVariable]:
         """The objects to which a DCF gives a value of its own (ParameterValue)."""

@@ -14,7 +14,8 @@ _ANGLE_NAMES = {0x10: "radian", 0x41: "degree", 0xB4: "revolution"}
 #: Increments, and no unit at all, which comes to the same.
 _INCREMENTS = (0xB5, 0x00)
 
-_POSITION_REVERSED = 1 << 7
+#: Bits of 0x607E: position, and (where a maker has it) torque.
+_REVERSED = 1 << 7 | 1 << 5
 
 _GIVE_COUNTS = "give drive.counts_per_rev (increments per turn of the motor)"
 
@@ -54,7 +55,10 @@ def read_scales(node: DriveNode, settings: DriveSettings) -> Scales:
             (f"{counts:g} counts per turn of the shaft", counts_source),
             (f"{gear:g} turns of the motor per turn of the shaft", gear_source),
             (f"{rated:g} N·m rated torque of the motor", rated_source),
-            (f"{limit_nm:g} N·m at most", limit_source),
+            (
+                f"{limit_nm:g} N·m at most" if math.isfinite(limit_nm) else "no torque limit",
+                limit_source,
+            ),
         ),
     )
 
@@ -106,8 +110,11 @@ def _rated_torque(node: DriveNode, settings: DriveSettings) -> tuple[float, str]
 
 
 def _torque_limit(node: DriveNode) -> tuple[float, str]:
-    """Per mille that 0x6072, 0x60E0 and 0x60E1 leave, and which of them is the lowest."""
-    indices = (od.MAX_TORQUE, od.POSITIVE_TORQUE_LIMIT, od.NEGATIVE_TORQUE_LIMIT)
+    """Per mille that 0x6072, 0x6073, 0x60E0 and 0x60E1 leave, and which of them is the lowest.
+
+    0x6073 is in per mille of the rated current, which gives the rated torque.
+    """
+    indices = (od.MAX_TORQUE, od.MAX_CURRENT, od.POSITIVE_TORQUE_LIMIT, od.NEGATIVE_TORQUE_LIMIT)
     limits = {index: node.read(index) for index in indices if node.has(index)}
     if not limits:
         return math.inf, "the drive has no 0x6072"
@@ -121,13 +128,13 @@ def _torque_limit(node: DriveNode) -> tuple[float, str]:
 
 
 def _check_polarity(node: DriveNode) -> None:
-    """0x607E turns the position, not the torque: the wall would pull where it has to push."""
+    """Position and torque turned against one another make the wall pull where it has to push."""
     if not node.has(od.POLARITY):
         return
     polarity = node.read(od.POLARITY)
-    if polarity & _POSITION_REVERSED:
+    if polarity & _REVERSED:
         raise DriveError(
-            f"node {node.node_id}, 0x607E = {polarity:#04x} turns the position against the torque: "
+            f"node {node.node_id}, 0x607E = {polarity:#04x} may turn the position against the torque: "
             f"clear it at the drive, or for the run by drive.parameters = "
             f'{{ "0x607E" = 0 }}, and use wall.side'
         )

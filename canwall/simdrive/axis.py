@@ -91,7 +91,8 @@ class Axis:
         self._shown = (False, False, False)
         self.state_machine = StateMachine(dictionary, self._refresh, self._at_rest)
         self._abort_option.allow((_NO_ACTION, _FAULT, _DISABLE_VOLTAGE, _QUICK_STOP))
-        self._mode.allow((NO_MODE, *_supported_modes(dictionary)))
+        # The power-on mode may be one that is not served, and may be gone back to.
+        self._mode.allow((NO_MODE, self._mode.default, *_supported_modes(dictionary)))
         self._mode.react = lambda _: self._refresh()
         self._controlword.react = self._control
 

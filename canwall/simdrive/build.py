@@ -9,6 +9,7 @@ from canwall.simdrive.drive import DEFAULT_BITRATE, SimulatedDrive
 from canwall.simdrive.hardware import Hardware
 from canwall.simdrive.memory import UNCONFIGURED, Memory
 from canwall.simdrive.motion import ServoMotion
+from canwall.simdrive.position_unit import quotient
 
 
 def make_drive(
@@ -20,7 +21,8 @@ def make_drive(
     """The drive that the configuration describes, not yet switched on.
 
     Rated torque and encoder are those of its dictionary (0x6076, 0x608F, 0x6091), and those of
-    the simulation where the dictionary has none. A node-ID that LSS has stored goes first.
+    the simulation where the dictionary has none, or an encoder of 1/1. A node-ID that LSS has
+    stored goes first.
     `bitrate` [bit/s] is that of the bus. Raises DictionaryError.
     """
     memory = Memory(simulation.store)
@@ -30,8 +32,10 @@ def make_drive(
     dictionary.supply(0x608F, 1, simulation.counts_per_rev)
     for unit in ((0x608F, 2), (0x6091, 1), (0x6091, 2)):
         dictionary.supply(*unit, 1)
-    gear_ratio = _quotient(dictionary, 0x6091)
-    counts = _quotient(dictionary, 0x608F) * gear_ratio
+    gear_ratio = quotient(dictionary, 0x6091)
+    # What the encoder has, whatever unit the drive shows. 1/1 says as little as nothing.
+    resolution = quotient(dictionary, 0x608F)
+    counts = (simulation.counts_per_rev if resolution == 1.0 else resolution) * gear_ratio
     motion = ServoMotion(simulation, sync_period_s, counts)
     hardware = _hardware(simulation, counts / (2.0 * math.pi), gear_ratio)
     return SimulatedDrive(
@@ -60,11 +64,3 @@ def _hardware(simulation: Simulation, counts_per_rad: float, gear_ratio: float) 
         positive_limit=switches and switches[1] * counts_per_rad,
         home=home and (home[0] * counts_per_rad, home[1] * counts_per_rad),
     )
-
-
-def _quotient(dictionary: Dictionary, index: int) -> float:
-    numerator = dictionary.number(index, 1, absent=1).value
-    denominator = dictionary.number(index, 2, absent=1).value
-    if numerator <= 0 or denominator <= 0:
-        raise dictionary.error(index, 1, f"{numerator}/{denominator} is no scale")
-    return float(numerator / denominator)

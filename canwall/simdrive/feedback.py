@@ -6,6 +6,7 @@ from typing import Protocol
 from canwall.simdrive.abort import AbortCode, AccessError
 from canwall.simdrive.dictionary import Dictionary
 from canwall.simdrive.hardware import Hardware
+from canwall.simdrive.position_unit import PositionUnit
 
 _INT32 = 1 << 31
 
@@ -39,7 +40,7 @@ class Feedback:
     """Latches the measured values into 0x6064 and 0x606C."""
 
     def __init__(self, dictionary: Dictionary, hardware: Hardware, motion: Motion) -> None:
-        """Serve 0x6064, 0x606C, 0x607E and 0x60A9 of the dictionary.
+        """Serve 0x6064, 0x606C, 0x607E, 0x60A9 and the factor group of the dictionary.
 
         Raises:
             DictionaryError: one of them is not an integer, or 0x60A9 begins with no unit of
@@ -52,6 +53,7 @@ class Feedback:
         self._polarity = dictionary.number(0x607E, absent=0)
         self._unit = dictionary.number(0x60A9, absent=0)
         self._unit.check = self._check_unit
+        self._position_unit = PositionUnit(dictionary)
         self._polarity.react = self._unit.react = lambda _: self._settle()
         self._shift = 0
         self.counts = 0
@@ -68,12 +70,14 @@ class Feedback:
     def reset(self) -> None:
         """Forget the homing, and take the objects as they stand."""
         self._shift = 0
+        self._position_unit.refresh()
         self._settle()
         self.sample()
 
     def home(self, position: int) -> None:
         """Let the present position be ``position`` (in the units of 0x6064)."""
-        self._shift = self._position_sign * position - self._motion.counts()
+        counts = round(position / self._position_unit.per_increment)
+        self._shift = self._position_sign * counts - self._motion.counts()
         self.sample()
 
     def speed_rad_s(self) -> float:
@@ -84,6 +88,9 @@ class Feedback:
         """Latch position and velocity."""
         self.counts = counts = self._motion.counts()
         position = self._position_sign * (counts + self._shift)
+        scale = self._position_unit.per_increment
+        if scale != 1.0:
+            position = math.floor(position * scale + 0.5)
         self._position.value = (position + _INT32) % (2 * _INT32) - _INT32
         speed = round(self._motion.speed_counts_per_s() * self._units_per_count)
         self._velocity.value = max(-_INT32, min(_INT32 - 1, speed))

@@ -104,6 +104,9 @@ def test_is_enabled_and_driven(vendor: Vendor, of_vendor: ConfiguredBench) -> No
 
 @pytest.mark.parametrize("mode", [1, 3, 5, 7, 8, 9])
 def test_modes_without_torque_are_refused(of_vendor: ConfiguredBench, mode: int) -> None:
+    if mode == of_vendor.read(0x6060):
+        of_vendor.write(0x6060, 0, mode, 1)  # the power-on mode may be gone back to
+        return
     with pytest.raises(SdoAbortedError, match="06090030"):
         of_vendor.write(0x6060, 0, mode, 1)
 
@@ -125,6 +128,7 @@ def test_units(vendor: Vendor, of_vendor: ConfiguredBench, monkeypatch: pytest.M
     bench.sync()
     assert torques[-1] == pytest.approx(0.1 * vendor.rated_torque_mnm / 1000)
     turn = SIMULATION.hand.rest_rad / 6.283185307179586
-    assert bench.read(0x6064) == pytest.approx(turn * vendor.counts_per_rev, abs=0.51)
+    # Rounded to increments of the encoder, then to the drive's unit (Nanotec: 0x60A8, 0.1 degree).
+    assert bench.read(0x6064) == pytest.approx(turn * vendor.counts_per_rev, abs=0.96)
     if vendor.rated_torque_mnm == 1250 and 0x6076 not in vendor.lacks:
         assert bench.read(0x6076) == 1250

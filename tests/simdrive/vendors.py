@@ -26,8 +26,8 @@ class Vendor:
 
 VENDORS = [
     Vendor("maxon_epos4_0x1018.eds", (10,), (0x6072, 0x608F, 0x6091), 1250, 4000),
-    Vendor("elmo_gold.dcf", (10, 4), (0x1005, 0x1007), 1250, 1),
-    Vendor("nanotec_C5-E-2-09.eds", (10, 4), (0x6076, 0x60E0), 1250, 4000),
+    Vendor("elmo_gold.dcf", (10, 4), (0x1005, 0x1007), 1250, 4000),
+    Vendor("nanotec_C5-E-2-09.eds", (10, 4), (0x6076, 0x60E0), 1250, 3600),
     Vendor("technosoft_iPOS.D.v1.04.eds", (10,), (0x1016, 0x6072, 0x6076), 1250, 4000),
     Vendor("ingenia_eve-net-c_1.8.1.eds", (10,), (0x1016, 0x6087), 1000, 4000),
 ]
