@@ -80,7 +80,7 @@ class BusRunner:
             self._tick(_TICK_S)
 
     def _handle(self, message: can.Message) -> None:
-        if message.is_error_frame or message.is_extended_id:
+        if message.is_error_frame or message.is_extended_id or message.is_fd:
             return
         if self._drive.real_time:
             # What a frame changes holds from its arrival on.

@@ -21,7 +21,7 @@ WAIT_S = 30.0
 SYNC_S = 0.005
 TORQUE = 80  # per mille; one of the drives is limited to 100 (0x6072)
 MODES = {4: "PROFILED TORQUE", 10: "CYCLIC SYNCHRONOUS TORQUE"}
-OPERATED = {vendor.file: vendor.modes for vendor in VENDORS} | {OWN: (10, 4)}
+OPERATED = {vendor.file: vendor.torque_modes for vendor in VENDORS} | {OWN: (10, 4)}
 
 CONFIG = """
 [bus]
@@ -126,6 +126,8 @@ def test_life_of_a_drive(served: Served) -> None:
         node.sdo[0x6007].raw = 1  # a lost connection is a fault
     if 0x6087 in described:
         node.sdo[0x6087].raw = 100_000
+    if 0x6073 in described:
+        node.sdo[0x6073].raw = 1000  # some begin with less current than TORQUE takes
     configure(node)
     node.setup_402_state_machine()
     node.nmt.state = "OPERATIONAL"
