@@ -6,12 +6,15 @@ what `[wall.options]` may set, in the order in which the function finds them in 
 """
 
 import importlib.util
-from collections.abc import Mapping
+import inspect
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
 
+from numba import njit
 from numba.core.errors import NumbaError
 
 from canwall.errors import InputError
@@ -135,6 +138,9 @@ def _load(path: Path, function: str) -> Law:
     written = getattr(module, function, None)
     if not isinstance(written, FunctionType):
         raise UnknownLawError(f"{where}: the file has no such function")
+    arguments = len(inspect.signature(written).parameters)
+    if arguments != 1:
+        raise UnknownLawError(f"{where}: takes {arguments} arguments; a law takes one, the wall")
     options = getattr(module, "OPTIONS", {})
     if not (
         isinstance(options, dict)
@@ -144,11 +150,27 @@ def _load(path: Path, function: str) -> Law:
     if len(options) > MAX_OPTIONS:
         raise UnknownLawError(f"{where}: {len(options)} options; a law may have {MAX_OPTIONS}")
     try:
-        return Law(where, law(written, keep=False), options)
+        return Law(where, law(_guarded(written), keep=False), options)
     except NumbaError as error:
         raise UnknownLawError(f"{where}: does not compile: {_gist(error)}") from None
     except Exception as error:  # numba lets what it trips over through
         raise UnknownLawError(f"{where}: {type(error).__name__}: {_gist(error)}") from None
+
+
+def _guarded(written: FunctionType) -> Callable[[Any], float]:
+    """A user's function whose exceptions become a force that is not a number, which ends the wall.
+
+    Compiled code that is called by address can raise to nobody.
+    """
+    compiled = njit(boundscheck=True)(written)
+
+    def guarded(wall: Any) -> float:
+        try:
+            return compiled(wall)  # type: ignore[no-any-return]
+        except Exception:
+            return math.nan
+
+    return guarded
 
 
 def _gist(error: BaseException) -> str:

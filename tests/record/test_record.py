@@ -1,7 +1,9 @@
 """The ring, the writer process and the folder: what was put in comes out, whoever dies."""
 
+import contextlib
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -323,3 +325,66 @@ def test_what_is_no_record(tmp_path: Path) -> None:
     folder.summary.write_text("{")
     with pytest.raises(ConfigError, match="not a summary of a run"):
         folder.read_summary()
+
+
+# A machine that goes dark, a disk that is full
+
+
+def wait_until_on_disk(folder: Path, rows: int) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while True:
+        with contextlib.suppress(ConfigError):  # nothing is there yet
+            if read_signals(folder / "signals.parquet").num_rows >= rows:
+                return
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_record_is_readable_without_its_end(tmp_path: Path) -> None:
+    """Loss of power: neither master nor writer gets to say a last word."""
+    recorder = Recorder(tmp_path, "bus.log", "ch", LAWS)
+    rows, frames = some_rows(3000), some_frames(100)
+    log(recorder.ring, frames)
+    for part in np.split(rows, 3):
+        put_rows(recorder.ring, part)
+        wait_until_on_disk(tmp_path, int(part["j"][-1]) + 1)
+    recorder._writer.kill()
+    recorder.close()
+    assert not (tmp_path / "signals.parquet").exists()
+    assert_rows(read_signals(tmp_path / "signals.parquet"), rows)
+    lines = (tmp_path / "bus.log").read_text().splitlines()
+    assert len(lines) == len(frames)
+
+
+def test_stream_that_was_cut_anywhere_is_readable_up_to_there(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path, None, "ch", LAWS)
+    rows = some_rows(1500)
+    for part in np.split(rows, 3):
+        put_rows(recorder.ring, part)
+        wait_until_on_disk(tmp_path, int(part["j"][-1]) + 1)
+    recorder._writer.kill()
+    recorder.close()
+    stream = tmp_path / "signals.arrows"
+    whole = stream.read_bytes()
+    found = set()
+    for size in range(len(whole), 2000, -997):
+        stream.write_bytes(whole[:size])
+        table = read_signals(tmp_path / "signals.parquet")
+        found.add(table.num_rows)
+        assert_rows(table, rows[: table.num_rows])
+    assert {0, 500, 1000, 1500} <= found | {0}
+    assert max(found) == 1500
+
+
+def test_disk_that_is_full_is_told_and_stops_nothing(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path, "bus.log", "ch", LAWS)
+    resource.prlimit(recorder._writer.pid, resource.RLIMIT_FSIZE, (100_000, 100_000))
+    rows = some_rows(ROWS // 2)
+    for _ in range(5):  # more than the ring holds
+        put_rows(recorder.ring, rows)
+        wait_until_written(recorder.ring)
+    (note,) = recorder.close()
+    assert note.startswith(f"{tmp_path}: the record is incomplete: ")
+    assert "File too large" in note
+    kept = read_signals(tmp_path / "signals.parquet")
+    assert 0 <= kept.num_rows < len(rows)

@@ -141,7 +141,7 @@ def test_helpers_constants_memory_and_plain_integers(write: Write) -> None:
             "does not compile: Untyped global name 'helper'",
         ),
         ("def mine(wall):\n    return wall.stifness\n", "KeyError: 'stifness'"),
-        ("def mine(wall, y):\n    return y\n", "TypeError: Signature mismatch: 1 argument"),
+        ("def mine(wall, y):\n    return y\n", "takes 2 arguments; a law takes one, the wall"),
         ("import math\nmath.nowhere\n", "AttributeError: module 'math' has no attribute 'nowhere'"),
         ("OPTIONS = ['a']\ndef mine(wall):\n    return 0.0\n", "OPTIONS "),
         ("OPTIONS = {'a': 'b'}\ndef mine(wall):\n    return 0.0\n", "OPTIONS "),
@@ -185,3 +185,23 @@ def test_run_says_it_in_one_line(write: Write, tmp_path: Path) -> None:
     assert f"{law}: does not compile: No conversion from none" in line
     assert done.returncode == 2
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "raise ValueError('no')",
+        "return wall.options[int(wall.stiffness)]",  # far beyond its end
+        "return 1 // int(wall.y)",
+    ],
+)
+def test_exception_in_a_law_is_a_force_that_is_no_number(tmp_path: Path, body: str) -> None:
+    file = tmp_path / "raises.py"
+    file.write_text(f"def raises(wall):\n    if wall.y < 0.0:\n        {body}\n    return 0.25\n")
+    found = find_law(f"{file}:raises")
+    bench = np.zeros(1, WALL)
+    bench["stiffness"] = 50.0
+    bench["y"] = 0.1
+    assert wall_force(found.address, bench[0]) == 0.25
+    bench["y"] = -0.1
+    assert not np.isfinite(wall_force(found.address, bench[0]))
