@@ -162,7 +162,7 @@ def _guarded(written: FunctionType) -> Callable[[Any], float]:
 
     Compiled code that is called by address can raise to nobody.
     """
-    compiled = njit(boundscheck=True)(written)
+    compiled = njit(error_model="python", boundscheck=True)(written)
 
     def guarded(wall: Any) -> float:
         try:
