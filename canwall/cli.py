@@ -128,8 +128,11 @@ def drive(
             highlight=False,
         )
 
+    def reported(fault: str) -> None:
+        _console.print(fault, soft_wrap=True, highlight=False, markup=False)
+
     with stop_on_signals() as stop:
-        serve_drive(settings, stop, joined)
+        serve_drive(settings, stop, joined, reported)
     return 0
 
 

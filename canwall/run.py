@@ -84,25 +84,37 @@ def open_bus(settings: Settings) -> can.BusABC:
         ) from None
 
 
-def make_simulated_drive(settings: Settings) -> simdrive.SimulatedDrive:
+def make_simulated_drive(
+    settings: Settings, report: Callable[[str], None] = lambda line: None
+) -> simdrive.FaultyDrive:
     """The drive of `[simulation]`, from the dictionary of `[drive]`.
 
-    Raises ConfigError, DictionaryError.
+    report is told in a line when one of its faults begins or ends. Raises
+    ConfigError, DictionaryError.
     """
     if settings.simulation is None:
         raise ConfigError("[simulation] is missing: there is no drive to simulate")
     bus = settings.bus
-    return simdrive.make_drive(settings.drive, settings.simulation, bus.cycle_s, bus.bitrate)
+    return simdrive.make_drive(
+        settings.drive, settings.simulation, bus.cycle_s, bus.bitrate, report
+    )
 
 
-def serve_drive(settings: Settings, stop: Callable[[], bool], joined: Callable[[], None]) -> None:
+def serve_drive(
+    settings: Settings,
+    stop: Callable[[], bool],
+    joined: Callable[[], None],
+    report: Callable[[str], None] = lambda line: None,
+) -> None:
     """A simulated drive alone on its bus, until stopped (`canwall drive`).
 
-    `joined` is called when it hears what is on the bus.
+    `joined` is called when it hears what is on the bus, report is told of its faults.
     """
-    drive = make_simulated_drive(settings)
+    drive = make_simulated_drive(settings, report)
     with open_bus(settings) as bus:
-        runner = simdrive.BusRunner(drive, bus)
+        # A controller makes its own error frames; given one, it sends it as data.
+        virtual = settings.bus.interface == "unixcan" or settings.bus.channel.startswith("vcan")
+        runner = simdrive.BusRunner(drive, bus, error_frames=virtual)
         joined()
         runner.run(stop)
 

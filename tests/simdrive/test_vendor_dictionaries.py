@@ -120,7 +120,7 @@ def test_supported_modes_are_shown(vendor: Vendor, of_vendor: ConfiguredBench) -
 def test_units(vendor: Vendor, of_vendor: ConfiguredBench, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = of_vendor
     torques: list[float] = []
-    motion = bench.drive._motion
+    motion = bench.drive.drive._motion
     monkeypatch.setattr(motion, "advance", lambda torque_nm, _: torques.append(torque_nm))
     bench.enable()
     bench.write(0x6071, 0, 100, 2)
