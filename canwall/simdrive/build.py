@@ -13,6 +13,9 @@ from canwall.simdrive.memory import UNCONFIGURED, Memory
 from canwall.simdrive.motion import ServoMotion
 from canwall.simdrive.position_unit import quotient
 
+_SERVO_DRIVE = 0x20192
+"""Device type: profile 402, servo drive."""
+
 
 def make_drive(
     drive: DriveSettings,
@@ -32,6 +35,7 @@ def make_drive(
     memory = Memory(simulation.store)
     node_id = memory.node_id or drive.node_id
     dictionary = Dictionary.load(drive.eds, drive.node_id if node_id == UNCONFIGURED else node_id)
+    dictionary.supply(0x1000, 0, _SERVO_DRIVE)
     dictionary.supply(0x6076, 0, round(1000.0 * simulation.rated_torque_nm))
     dictionary.supply(0x608F, 1, simulation.counts_per_rev)
     for unit in ((0x608F, 2), (0x6091, 1), (0x6091, 2)):
