@@ -4,17 +4,21 @@ import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 from can import CanError
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from canwall import config
 from canwall.config import ConfigError, Settings, absolute_law
 from canwall.errors import InputError, RunFailedError
+
+if TYPE_CHECKING:
+    from canwall.bench import Findings
 
 app = typer.Typer(
     add_completion=False,
@@ -32,6 +36,13 @@ _errors = Console(stderr=True, soft_wrap=True, highlight=False)
 _ConfigArgument = Annotated[
     Path | None, typer.Argument(metavar="[CONFIG]", help="A TOML file; without: config/sim.toml.")
 ]
+_EdsOption = Annotated[
+    Path | None, typer.Option("--eds", metavar="PATH", help="The drive's EDS or DCF.")
+]
+_NoWatchdogOption = Annotated[
+    bool,
+    typer.Option("--accept-no-watchdog", help="Go on with a drive that has no watchdog."),
+]
 
 
 def _settings(path: Path | None, **overrides: Any) -> Settings:
@@ -40,6 +51,11 @@ def _settings(path: Path | None, **overrides: Any) -> Settings:
         key.replace("__", "."): value for key, value in overrides.items() if value is not None
     }
     return config.load(path or config.shipped("config/sim.toml"), dotted)
+
+
+def _absolute(path: Path | None) -> Path | None:
+    """What is given on the command line is relative to where one is, not to the configuration."""
+    return path and path.resolve()
 
 
 @app.command()
@@ -56,6 +72,11 @@ def run(
     damping: Annotated[float | None, typer.Option(help="Damping [N·m·s/rad].")] = None,
     duration: Annotated[float | None, typer.Option(help="Seconds; without: until Ctrl-C.")] = None,
     output: Annotated[Path | None, typer.Option(help="Folder of the run's record.")] = None,
+    eds: _EdsOption = None,
+    accept_no_watchdog: _NoWatchdogOption = False,
+    restore: Annotated[
+        bool, typer.Option("--restore", help="Put back what the set-up changed in the drive.")
+    ] = False,
 ) -> int:
     """Render the wall: enable the drive, run, record, disable it again.
 
@@ -63,7 +84,16 @@ def run(
     changes of law that the file schedules.
     """
     files = config_files or [config.shipped("config/sim.toml")]
-    many = [_run_settings(path, law, stiffness, damping, duration) for path in files]
+    overrides = {
+        "wall__law": law and absolute_law(law, Path()),
+        "wall__stiffness_nm_per_rad": stiffness,
+        "wall__damping_nm_s_per_rad": damping,
+        "run__duration_s": duration,
+        "drive__eds": _absolute(eds),
+        "drive__accept_no_watchdog": accept_no_watchdog or None,
+        "drive__restore": restore or None,
+    }
+    many = [_run_settings(path, overrides) for path in files]
     from canwall.run import run_together  # numba takes a second to load: not for --help
 
     with _RunProgress() as shown:
@@ -71,6 +101,8 @@ def run(
     for result in results:
         _console.print(_strike_table(result.summary["strikes"]))
         _console.print(f"record: {result.folder.path}", soft_wrap=True, highlight=False)
+        for remark in result.remarks:
+            _error(remark)
         for note in result.notes:
             _error(note)
     outcome = results[0].outcome
@@ -81,21 +113,9 @@ def run(
     return INTERRUPTED if outcome.interrupted else 0
 
 
-def _run_settings(
-    path: Path,
-    law: str | None,
-    stiffness: float | None,
-    damping: float | None,
-    duration: float | None,
-) -> Settings:
-    settings = _settings(
-        path,
-        wall__law=law and absolute_law(law, Path()),
-        wall__stiffness_nm_per_rad=stiffness,
-        wall__damping_nm_s_per_rad=damping,
-        run__duration_s=duration,
-    )
-    if law is not None:
+def _run_settings(path: Path, overrides: dict[str, Any]) -> Settings:
+    settings = _settings(path, **overrides)
+    if overrides["wall__law"] is not None:
         kept = tuple(change.model_copy(update={"law": None}) for change in settings.schedule)
         settings = settings.model_copy(update={"schedule": kept})
     return settings
@@ -107,9 +127,10 @@ def drive(
     real_time: Annotated[
         bool, typer.Option("--real-time", help="Time as measured, not a period per SYNC.")
     ] = False,
+    eds: _EdsOption = None,
 ) -> int:
     """A simulated drive, alone on the bus of CONFIG, until stopped."""
-    settings = _settings(config_file)
+    settings = _settings(config_file, drive__eds=_absolute(eds))
     if real_time and settings.simulation is not None:
         simulation = settings.simulation.model_copy(update={"real_time": True})
         settings = settings.model_copy(update={"simulation": simulation})
@@ -128,9 +149,68 @@ def drive(
             highlight=False,
         )
 
+    def reported(fault: str) -> None:
+        _console.print(fault, soft_wrap=True, highlight=False, markup=False)
+
     with stop_on_signals() as stop:
-        serve_drive(settings, stop, joined)
+        serve_drive(settings, stop, joined, reported)
     return 0
+
+
+@app.command()
+def doctor(
+    config_file: Annotated[Path, typer.Argument(metavar="CONFIG", help="A TOML file.")],
+    eds: _EdsOption = None,
+    accept_no_watchdog: _NoWatchdogOption = False,
+) -> int:
+    """Find the drive, show how it would be set up and why, and test its watchdog.
+
+    The drive is enabled with zero torque for the test. What was changed is put back.
+    """
+    settings = _settings(
+        config_file,
+        drive__eds=_absolute(eds),
+        drive__accept_no_watchdog=accept_no_watchdog or None,
+    )
+    from canwall.bench import Findings, examine
+    from canwall.drive import REQUIRED_OBJECTS
+    from canwall.run import on_the_bus
+
+    def announce(what: str) -> None:
+        _errors.print(f"doctor: {what}", markup=False)
+
+    findings = Findings()
+    try:
+        with on_the_bus(settings) as link:
+            examine(link, settings, REQUIRED_OBJECTS, announce, findings)
+    finally:
+        _show_findings(findings)
+    return 0 if findings.well else FAILED
+
+
+def _show_findings(findings: "Findings") -> None:
+    """A table for people at a terminal, a line each for everybody else."""
+    if not _console.is_terminal:
+        for line in findings.lines:
+            trouble = "" if line.well else "TROUBLE: "
+            _console.print(
+                f"{line.section}: {line.what}: {trouble}{line.found}",
+                markup=False,
+                highlight=False,
+                soft_wrap=True,
+            )
+        return
+    table = Table(title="Doctor", title_justify="left")
+    for column in ("", "from", "found"):
+        table.add_column(column)
+    section = ""
+    for line in findings.lines:
+        style = "" if line.well else "bold red"
+        shown = "" if line.section == section else line.section
+        table.add_row(*(escape(text) for text in (shown, line.what, line.found)), style=style)
+        section = line.section
+    if findings.lines:
+        _console.print(table)
 
 
 @app.command()

@@ -64,7 +64,7 @@ def load_eds(path: Path, node_id: int, required: Iterable[int] = ()) -> ObjectDi
     `required` objects (indices).
     """
     if not path.is_file():
-        raise DictionaryError(f"{path}: no such EDS or DCF; correct drive.eds")
+        raise DictionaryError(f"{path}: no such EDS or DCF; correct drive.eds, or give --eds")
     # canopen logs a traceback for an odd entry and goes on; what matters is missed below.
     logging.getLogger("canopen.objectdictionary").setLevel(logging.CRITICAL)
     try:

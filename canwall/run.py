@@ -84,25 +84,37 @@ def open_bus(settings: Settings) -> can.BusABC:
         ) from None
 
 
-def make_simulated_drive(settings: Settings) -> simdrive.SimulatedDrive:
+def make_simulated_drive(
+    settings: Settings, report: Callable[[str], None] = lambda line: None
+) -> simdrive.FaultyDrive:
     """The drive of `[simulation]`, from the dictionary of `[drive]`.
 
-    Raises ConfigError, DictionaryError.
+    report is told in a line when one of its faults begins or ends. Raises
+    ConfigError, DictionaryError.
     """
     if settings.simulation is None:
         raise ConfigError("[simulation] is missing: there is no drive to simulate")
     bus = settings.bus
-    return simdrive.make_drive(settings.drive, settings.simulation, bus.cycle_s, bus.bitrate)
+    return simdrive.make_drive(
+        settings.drive, settings.simulation, bus.cycle_s, bus.bitrate, report
+    )
 
 
-def serve_drive(settings: Settings, stop: Callable[[], bool], joined: Callable[[], None]) -> None:
+def serve_drive(
+    settings: Settings,
+    stop: Callable[[], bool],
+    joined: Callable[[], None],
+    report: Callable[[str], None] = lambda line: None,
+) -> None:
     """A simulated drive alone on its bus, until stopped (`canwall drive`).
 
-    `joined` is called when it hears what is on the bus.
+    `joined` is called when it hears what is on the bus, report is told of its faults.
     """
-    drive = make_simulated_drive(settings)
+    drive = make_simulated_drive(settings, report)
     with open_bus(settings) as bus:
-        runner = simdrive.BusRunner(drive, bus)
+        # A controller makes its own error frames; given one, it sends it as data.
+        virtual = settings.bus.interface == "unixcan" or settings.bus.channel.startswith("vcan")
+        runner = simdrive.BusRunner(drive, bus, error_frames=virtual)
         joined()
         runner.run(stop)
 
@@ -124,7 +136,12 @@ def make_axis(
     `dictionary` is what `[drive] eds` describes. Nothing is enabled yet. Raises DriveError.
     """
     node = DriveNode(link, settings.drive.node_id, dictionary)
-    setup = set_up(node, settings.drive, settings.bus, settings.real_time)
+    try:
+        setup = set_up(node, settings.drive, settings.bus, settings.real_time)
+    except BaseException:
+        if settings.drive.restore:
+            node.restore()
+        raise
     period = settings.bus.cycle_s
     changes = [
         Change(round(at_s / period), wall, limits) for at_s, wall, limits in settings.stages[1:]
@@ -173,12 +190,13 @@ def render(
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run came to."""
+    """What a run came to: notes are what the record lacks, remarks what the drive would not do."""
 
     folder: RunFolder
     summary: dict[str, Any]
     outcome: Outcome
     notes: list[str]
+    remarks: list[str]
 
 
 def run(
@@ -227,30 +245,47 @@ def run_together(
                 )
             link.log = recorders[0].ring.log_frame
             report("setting up the drive" if len(many) == 1 else "setting up the drives")
-            axes = [
-                make_axis(link, settings, dictionary, known, recorder.ring)
+            with restored() as (axes, not_restored):
                 for settings, dictionary, known, recorder in zip(
                     many, dictionaries, laws, recorders, strict=True
-                )
-            ]
-            exchange = make_exchange(link, axes)
-            watch = make_watch(link, axes)
-            report("rendering")
-            with stop_on_signals() as stop, scheduled(first) as scheduling:
-                outcome = render(
-                    exchange, stop, lambda now_s: progress(now_s, first.run.duration_s)
-                )
+                ):
+                    axes.append(make_axis(link, settings, dictionary, known, recorder.ring))
+                exchange = make_exchange(link, axes)
+                watch = make_watch(link, axes)
+                report("rendering")
+                with stop_on_signals() as stop, scheduled(first) as scheduling:
+                    outcome = render(
+                        exchange, stop, lambda now_s: progress(now_s, first.run.duration_s)
+                    )
         finally:
             notes = [recorder.close() for recorder in recorders]
     report("summarising")
     results = []
     for axis, folder, noted in zip(axes, folders, notes, strict=True):
         said = [*noted, *watch.notes] if axis is axes[0] else noted
-        results.append(_result(axis, exchange, watch, scheduling, folder, outcome, said))
+        remarks = [*_remarks(axis.setup, axis.settings), *not_restored.get(axis.name, [])]
+        results.append(_result(axis, exchange, watch, scheduling, folder, outcome, said, remarks))
     report("drawing")
     for folder in folders:
         plot_run(folder)
     return results
+
+
+@contextmanager
+def restored() -> Iterator[tuple[list[Axis], dict[str, list[str]]]]:
+    """Axes whose drives are put back at the end, where `[drive] restore` asks for it.
+
+    Yields the list to fill with them, and what will be left by their names: that which could not
+    be put back.
+    """
+    axes: list[Axis] = []
+    left: dict[str, list[str]] = {}
+    try:
+        yield axes, left
+    finally:
+        for axis in axes:
+            if axis.settings.drive.restore:
+                left[axis.name] = axis.node.restore()
 
 
 def scheduled(settings: Settings) -> AbstractContextManager[str]:
@@ -289,6 +324,7 @@ def _result(
     folder: RunFolder,
     outcome: Outcome,
     notes: list[str],
+    remarks: list[str],
 ) -> RunResult:
     """Summary of one axis, and its last cycles where it tripped."""
     settings = axis.settings
@@ -314,7 +350,7 @@ def _result(
     folder.summary.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     if outcome.trip_cycle is not None:
         folder.write_trip(signals, outcome.trip_cycle)
-    return RunResult(folder, summary, outcome, notes)
+    return RunResult(folder, summary, outcome, notes, remarks)
 
 
 def _recorded(folder: RunFolder, troubles: list[str]) -> pa.Table:
@@ -372,8 +408,24 @@ def _call_all(functions: Sequence[Callable[[], None]]) -> None:
         function()
 
 
-def _described(setup: DriveSetup) -> dict[str, float]:
+def _remarks(setup: DriveSetup, settings: Settings) -> list[str]:
+    remarks = [f"the drive: {note}" for note in setup.notes]
+    if setup.torque_limit_nm < settings.limits.torque_nm and setup.scales is not None:
+        whence = setup.scales.sources[-1][1]
+        remarks.append(
+            f"the drive holds the torque to {setup.torque_limit_nm:g} N·m ({whence}), below "
+            f"limits.torque_nm = {settings.limits.torque_nm:g}; [drive.parameters] may raise it"
+        )
+    if setup.watchdog.kind == "none":
+        remarks.append("the drive has no watchdog: a master that dies leaves the torque on")
+    return remarks
+
+
+def _described(setup: DriveSetup) -> dict[str, Any]:
     return {
+        "mode": str(setup.mode),
+        "watchdog": str(setup.watchdog),
+        "notes": list(setup.notes),
         "rad_per_count": setup.units.rad_per_count,
         "nm_per_mille": setup.units.nm_per_mille,
         "tpdo_cob_id": setup.tpdo.cob_id,

@@ -5,6 +5,7 @@ is a `ConfigError` of one line: file, key, what is wrong, what to do.
 """
 
 from canwall.config.drive import Drive
+from canwall.config.fault import AMOUNTS, NUMBERS, ON_FRAMES, Direction, Fault, FaultName
 from canwall.config.reading import ConfigError, absolute_law, load, shipped
 from canwall.config.settings import (
     Bus,
@@ -20,11 +21,17 @@ from canwall.config.settings import (
 from canwall.config.simulation import Hand, Simulation
 
 __all__ = [
+    "AMOUNTS",
+    "NUMBERS",
+    "ON_FRAMES",
     "Bus",
     "Change",
     "ConfigError",
+    "Direction",
     "Drive",
     "Estimator",
+    "Fault",
+    "FaultName",
     "Hand",
     "Limits",
     "Mechanics",

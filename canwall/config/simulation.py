@@ -5,6 +5,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, field_validator, model_validator
 
+from canwall.config.fault import Fault
 from canwall.config.section import NonNegative, Number, Positive, Section
 
 
@@ -48,6 +49,7 @@ class Simulation(Section):
 
     Time is one `[bus] cycle_s` per SYNC or, with `real_time`, what is measured. The torque of an
     RPDO acts `torque_delay_cycles` periods after the SYNC (synchronous) or the arrival (254, 255).
+    The faults are those of one `seed`.
     """
 
     rated_torque_nm: Annotated[Positive, Field(ge=0.001)] = 0.637
@@ -63,7 +65,14 @@ class Simulation(Section):
     store: Path | None = None
     real_time: bool = False
     torque_delay_cycles: Annotated[NonNegative, Field(le=1000.0)] = 0.0
+    seed: int = Field(0, ge=0)
     hand: Hand = Hand()
+    fault: tuple[Fault, ...] = ()
+
+    @field_validator("fault", mode="before")
+    @classmethod
+    def _faults(cls, value: object) -> object:
+        return tuple(value) if isinstance(value, list) else value
 
     @field_validator("limit_switches_rad", "home_switch_rad", mode="before")
     @classmethod

@@ -103,7 +103,10 @@ class DriveNode:
 
         In this order a PDO is switched off before its mapping is touched, as it was on the way in.
         """
-        self.command("PRE-OPERATIONAL")
+        try:
+            self.command("PRE-OPERATIONAL")
+        except can.CanError as error:
+            return [f"node {self.node_id}: nothing was put back, the bus failed: {error}"]
         failed = []
         while self._changes:
             index, subindex, before = self._changes.pop()

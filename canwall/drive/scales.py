@@ -134,8 +134,8 @@ def _check_polarity(node: DriveNode) -> None:
     polarity = node.read(od.POLARITY)
     if polarity & _REVERSED:
         raise DriveError(
-            f"node {node.node_id}, 0x607E = {polarity:#04x} may turn the position against the torque: "
-            f"clear it at the drive, or for the run by drive.parameters = "
+            f"node {node.node_id}, 0x607E = {polarity:#04x} may turn the position against the "
+            f"torque: clear it at the drive, or for the run by drive.parameters = "
             f'{{ "0x607E" = 0 }}, and use wall.side'
         )
 

@@ -4,14 +4,20 @@ Everything is compiled and free of allocation on the hot path. Nothing here know
 control laws, of drives or of CAN.
 """
 
+from canwall.physics.contact import Grasp, Hand, advance_grasp
 from canwall.physics.motion import MAX_EVENTS, PLANT, advance, contact_end, make_plant, time_to_wall
 from canwall.physics.oscillator import acceleration, basis, flow, zoh, zoh_coefficients
+from canwall.physics.smooth import Force
 
 __all__ = [
     "MAX_EVENTS",
     "PLANT",
+    "Force",
+    "Grasp",
+    "Hand",
     "acceleration",
     "advance",
+    "advance_grasp",
     "basis",
     "contact_end",
     "flow",

@@ -1,24 +1,39 @@
-"""Motion of a handle with Coulomb friction and, where there is one, a continuous wall: event-exact.
+"""Motion of a handle with Coulomb friction, cogging and, where there is one, a continuous wall.
 
-Between events the handle is the linear oscillator of `oscillator`. Events are the reversal of
-the velocity (where friction changes its sign, or the handle sticks) and the crossing of the wall
-at y = 0. Each is found as the one root in a bracket on which its function is monotone, so none is
-missed and none is found twice.
+Event-exact: between events the handle is the linear oscillator of `smooth`. Events are the
+reversal of the velocity (where friction changes its sign, or the handle sticks), its breaking
+loose, and the crossing of the wall at y = 0 or from one half of a cog to the next. Each is found
+as the one root in a bracket on which its function is monotone, so none is missed and none is
+found twice.
 
 The same function moves the simulated drive (no wall: the drive's torque is the wall) and the
 continuous referent that every law is compared with (a wall of stiffness K and damping B).
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
-from canwall.physics.oscillator import acceleration, flow
+from canwall.physics.oscillator import acceleration
+from canwall.physics.smooth import (
+    ACCELERATION,
+    VELOCITY,
+    Force,
+    Smooth,
+    Watch,
+    first_turn,
+    later,
+    root,
+    state,
+)
 
 #: What moves and what it moves against. Inside the wall (y < 0) stiffness K and damping B join
-#: the spring and the viscous damping. Units: any consistent set, SI in this project.
+#: the spring and the viscous damping. The cogging torque is a triangle wave over y + cog_origin
+#: with amplitude `cogging` and period `cog_pitch`, pulling towards 0 at 0: it stores and returns
+#: energy. Units: any consistent set, SI in this project.
 PLANT = np.dtype(
     [
         ("mass", "f8"),
@@ -27,6 +42,9 @@ PLANT = np.dtype(
         ("coulomb", "f8"),
         ("wall_stiffness", "f8"),
         ("wall_damping", "f8"),
+        ("cogging", "f8"),
+        ("cog_pitch", "f8"),
+        ("cog_origin", "f8"),
     ],
     align=True,
 )
@@ -35,8 +53,7 @@ PLANT = np.dtype(
 #: than followed for ever. A period of a servo loop has a handful.
 MAX_EVENTS = 1_000_000
 
-_POSITION, _VELOCITY, _ACCELERATION = 0, 1, 2
-_MAX_ITERATIONS = 200
+_ROUNDING = 2.0**-52
 
 
 def make_plant(
@@ -46,96 +63,30 @@ def make_plant(
     coulomb: float = 0.0,
     wall_stiffness: float = 0.0,
     wall_damping: float = 0.0,
+    cogging: float = 0.0,
+    cog_pitch: float = 1.0,
 ) -> NDArray[np.void]:
     """One plant as an array of shape (1,) and dtype PLANT, as compiled code takes it.
 
-    Raises ValueError unless mass > 0 and the rest ≥ 0, all finite.
+    Raises ValueError unless mass and cog_pitch > 0 and the rest ≥ 0, all finite.
     """
-    values = (mass, viscous, spring, coulomb, wall_stiffness, wall_damping)
-    if not all(math.isfinite(x) and x >= 0.0 for x in values) or mass == 0.0:
+    values = (mass, viscous, spring, coulomb, wall_stiffness, wall_damping, cogging, cog_pitch)
+    if not all(math.isfinite(x) and x >= 0.0 for x in values) or mass == 0.0 or cog_pitch == 0.0:
         raise ValueError(f"a plant needs mass > 0 and finite parameters ≥ 0, not {values}")
-    return np.array([values], dtype=PLANT)
+    return np.array([(*values, 0.0)], dtype=PLANT)
 
 
-@compiled
-def _derivatives(
-    mass: float, viscous: float, spring: float, y: float, v: float, u0: float, u1: float, t: float
-) -> tuple[float, float, float, float]:
-    """Position, velocity, acceleration and jerk at time t."""
-    y, v = flow(mass, viscous, spring, y, v, u0, u1, t)
-    a = acceleration(mass, viscous, spring, y, v, u0 + u1 * t)
-    return y, v, a, (u1 - viscous * a - spring * v) / mass
+class Piece(NamedTuple):
+    """A stretch of positions over which what the handle moves against is linear.
 
-
-@compiled
-def _root(
-    order: int,
-    mass: float,
-    viscous: float,
-    spring: float,
-    y: float,
-    v: float,
-    u0: float,
-    u1: float,
-    low: float,
-    high: float,
-    rising: bool,
-) -> float:
-    """The root of position, velocity or acceleration in (low, high]: Newton kept in its bracket."""
-    rounding = 4e-16 * high
-    t = 0.5 * (low + high)
-    for _ in range(_MAX_ITERATIONS):
-        y_t, v_t, a_t, jerk_t = _derivatives(mass, viscous, spring, y, v, u0, u1, t)
-        if order == _POSITION:
-            value, slope = y_t, v_t
-        elif order == _VELOCITY:
-            value, slope = v_t, a_t
-        else:
-            value, slope = a_t, jerk_t
-        if (value < 0.0) == rising:
-            low = t
-        else:
-            high = t
-        step = value / slope if slope != 0.0 else math.inf
-        if abs(step) <= rounding:
-            return t
-        proposal = t - step
-        if not low < proposal < high:
-            proposal = 0.5 * (low + high)
-        if abs(proposal - t) <= rounding or proposal in (low, high):
-            return proposal
-        t = proposal
-    return t
-
-
-@compiled
-def _reversal(
-    mass: float,
-    viscous: float,
-    spring: float,
-    y: float,
-    v: float,
-    u0: float,
-    u1: float,
-    direction: float,
-    span: float,
-) -> float:
-    """First time in (0, span] at which the velocity has turned against `direction`, else span.
-
-    span is at most a quarter period, so the acceleration has one zero at the most and the
-    velocity is monotone on either side of it.
+    viscous and spring are the sums of what acts there, force is what they pull with at y = 0.
     """
-    _, v_end, a_end, _ = _derivatives(mass, viscous, spring, y, v, u0, u1, span)
-    a_start = acceleration(mass, viscous, spring, y, v, u0)
-    peak = 0.0
-    if a_start * a_end < 0.0:
-        peak = _root(_ACCELERATION, mass, viscous, spring, y, v, u0, u1, 0.0, span, a_end > 0.0)
-        _, v_peak, _, _ = _derivatives(mass, viscous, spring, y, v, u0, u1, peak)
-        if direction * v_peak < 0.0:
-            return _root(_VELOCITY, mass, viscous, spring, y, v, u0, u1, 0.0, peak, direction < 0.0)
-    if direction * v_end < 0.0:
-        return _root(_VELOCITY, mass, viscous, spring, y, v, u0, u1, peak, span, direction < 0.0)
-    return span
+
+    viscous: float
+    spring: float
+    force: float
+    lower: float
+    upper: float
 
 
 @compiled
@@ -147,62 +98,211 @@ def _is_inside(plant: Record, y: float, v: float, pull: float) -> bool:
 
 
 @compiled
-def _segment(
-    plant: Record, y: float, v: float, u0: float, u1: float, remaining: float, inside: bool
-) -> tuple[float, float, float]:
-    """Motion up to the next event, no longer than `remaining`: (duration, y, ẏ).
+def _upper_edge(plant: Record, index: int) -> float:
+    """Where a half of a cog ends. One formula for all that is compared with it, to the last bit."""
+    return (index + 0.5) * (0.5 * plant.cog_pitch) - plant.cog_origin
 
-    At a crossing of the wall y is 0 exactly, at a reversal ẏ is; both are what the next segment
-    recognises them by.
+
+@compiled
+def _half_cog(plant: Record, y: float, v: float, u: float) -> Piece:
+    """The half of a cog at y: a spring about its middle that pulls back, or pushes away."""
+    half = 0.5 * plant.cog_pitch
+    index = math.floor((y + plant.cog_origin) / half + 0.5)
+    # The edges decide, not the rounding of the division.
+    if y < _upper_edge(plant, index - 1):
+        index -= 1
+    elif y >= _upper_edge(plant, index):
+        index += 1
+    if y == _upper_edge(plant, index - 1):
+        # On an edge the motion decides, at rest what pulls; the torque is the same on both sides.
+        torque = plant.cogging if index % 2 == 0 else -plant.cogging
+        if v < 0.0 or (v == 0.0 and u + torque - plant.spring * y < 0.0):
+            index -= 1
+    stiffness = 2.0 * plant.cogging / half
+    if index % 2 != 0:
+        stiffness = -stiffness
+    return Piece(
+        plant.viscous,
+        plant.spring + stiffness,
+        stiffness * (index * half - plant.cog_origin),
+        _upper_edge(plant, index - 1),
+        _upper_edge(plant, index),
+    )
+
+
+@compiled
+def piece_at(plant: Record, y: float, v: float, u: float) -> tuple[Piece, bool]:
+    """What the handle moves against at y under the external force u, and whether the wall acts."""
+    piece = Piece(plant.viscous, plant.spring, 0.0, -math.inf, math.inf)
+    if plant.cogging > 0.0:
+        piece = _half_cog(plant, y, v, u)
+    if plant.wall_stiffness == 0.0 and plant.wall_damping == 0.0:
+        return piece, False
+    inside = _is_inside(plant, y, v, u + piece.force - piece.spring * y)
+    if inside:
+        return Piece(
+            piece.viscous + plant.wall_damping,
+            piece.spring + plant.wall_stiffness,
+            piece.force,
+            piece.lower,
+            min(piece.upper, 0.0),
+        ), True
+    return Piece(
+        piece.viscous, piece.spring, piece.force, max(piece.lower, 0.0), piece.upper
+    ), False
+
+
+@compiled
+def _time_to_break_loose(
+    pull: float, coulomb: float, force: Force, horizon: float
+) -> tuple[float, float]:
+    """When what pulls a stuck handle exceeds its friction, and in which direction; else inf.
+
+    pull is what pulls it now, `force` how that changes.
     """
-    viscous = plant.viscous + (plant.wall_damping if inside else 0.0)
-    spring = plant.spring + (plant.wall_stiffness if inside else 0.0)
+    if force.excess == 0.0:
+        if force.slope == 0.0:
+            return math.inf, 0.0
+        direction = 1.0 if force.slope > 0.0 else -1.0
+        return max(coulomb - direction * pull, 0.0) / abs(force.slope), direction
+    # A free unit mass is accelerated by what pulls: what is left of the friction is watched.
+    free = Smooth(1.0, 0.0, 0.0, 0.0, 0.0, pull, force.slope, force.excess, force.rate)
+    up = first_turn(free, Watch(coulomb, 0.0, 0.0, 0.0, -1.0), 1.0, horizon)
+    down = first_turn(free, Watch(coulomb, 0.0, 0.0, 0.0, 1.0), 1.0, horizon)
+    return (up, 1.0) if up <= down else (down, -1.0)
+
+
+@compiled
+def onset(
+    plant: Record, piece: Piece, y: float, v: float, force: Force, horizon: float
+) -> tuple[float, Smooth, float]:
+    """How it goes on from here: (time it stays stuck, motion after that, its direction).
+
+    A handle that stays stuck beyond `horizon` has a time of at least that.
+    """
+    spring = piece.spring
+    u = force.constant + piece.force
     stuck = 0.0
     if v != 0.0:
         direction = 1.0 if v > 0.0 else -1.0
-        force = u0 - direction * plant.coulomb
+        constant = u - direction * plant.coulomb
     else:
-        pull = u0 - spring * y
+        pull = u - spring * y
         direction = 1.0 if pull > 0.0 else -1.0
-        force = u0 - direction * plant.coulomb
+        constant = u - direction * plant.coulomb
         # Asked of what the flow will be given: one that rounds to the other side of the
         # threshold would be turned back at once, and time would stand still.
-        if direction * (force - spring * y) <= 0.0:
-            # Stuck until the ramp of the external force breaks it loose, if it does.
-            if u1 == 0.0:
-                return remaining, y, v
-            direction = 1.0 if u1 > 0.0 else -1.0
-            stuck = max(plant.coulomb - direction * pull, 0.0) / abs(u1)
-            if stuck >= remaining:
-                return remaining, y, v
-            # Friction and spring balance to the last bit here; recomputed from u₀ + u₁·t the
+        if direction * (constant - spring * y) <= 0.0:
+            # Stuck until the external force breaks it loose, if it does.
+            stuck, direction = _time_to_break_loose(pull, plant.coulomb, force, horizon)
+            if stuck < horizon:
+                force = later(force, stuck)
+            # Friction and spring balance to the last bit here; recomputed from the force the
             # acceleration could come out with the wrong sign and end the slip at once.
-            force = spring * y
-    omega = math.sqrt(spring / plant.mass)
-    span = remaining - stuck
-    if omega > 0.0:
-        span = min(span, 0.5 * math.pi / omega)
+            constant = spring * y
+    motion = Smooth(
+        plant.mass,
+        piece.viscous,
+        spring,
+        y,
+        v,
+        constant,
+        force.slope,
+        force.excess,
+        force.rate,
+    )
+    return stuck, motion, direction
+
+
+@compiled
+def _reversal(motion: Smooth, direction: float, span: float, y_end: float, v_end: float) -> float:
+    """First time in (0, span] at which the velocity has turned against `direction`, else span.
+
+    span is at most a quarter period, (y_end, v_end) the state then.
+    """
+    if motion.excess != 0.0:
+        return min(first_turn(motion, VELOCITY, direction, span), span)
+    # Without a lag the acceleration has one zero at the most, and the velocity is monotone on
+    # either side of it.
+    m = motion
+    a_start = acceleration(m.mass, m.viscous, m.spring, m.y, m.v, m.constant)
+    a_end = acceleration(m.mass, m.viscous, m.spring, y_end, v_end, m.constant + m.slope * span)
+    peak = 0.0
+    if a_start * a_end < 0.0:
+        peak = root(motion, ACCELERATION, 0, 0.0, span, a_end > 0.0)
+        _, v_peak = state(motion, peak)
+        if direction * v_peak < 0.0:
+            return root(motion, VELOCITY, 0, 0.0, peak, direction < 0.0)
+    if direction * v_end < 0.0:
+        return root(motion, VELOCITY, 0, peak, span, direction < 0.0)
+    return span
+
+
+@compiled
+def quarter_period(mass: float, spring: float) -> float:
+    """Of the undamped oscillator; the time in which a negative spring has its say; else inf."""
+    omega = math.sqrt(abs(spring) / mass)
+    return 0.5 * math.pi / omega if omega > 0.0 else math.inf
+
+
+@compiled
+def slide(
+    piece: Piece, motion: Smooth, direction: float, horizon: float
+) -> tuple[float, float, float]:
+    """Motion up to the next event, no longer than horizon: (duration, y, ẏ).
+
+    At the edge of a piece y is that edge exactly, at a reversal ẏ is 0; both are what the next
+    motion recognises them by.
+    """
+    span = min(horizon, quarter_period(motion.mass, motion.spring))
     # Up to its reversal the velocity keeps its sign, so the position is monotone.
-    dt = _reversal(plant.mass, viscous, spring, y, v, force, u1, direction, span)
-    y_end, v_end = flow(plant.mass, viscous, spring, y, v, force, u1, dt)
-    leaves = inside and direction > 0.0 and y_end >= 0.0
-    enters = not inside and direction < 0.0 and y_end < 0.0
-    if leaves or (enters and _is_inside(plant, y_end, v_end, 0.0)):
-        dt = _root(
-            _POSITION, plant.mass, viscous, spring, y, v, force, u1, 0.0, dt, direction > 0.0
-        )
-        _, v_end = flow(plant.mass, viscous, spring, y, v, force, u1, dt)
-        return stuck + dt, 0.0, v_end
+    y_end, v_end = state(motion, span)
+    dt = _reversal(motion, direction, span, y_end, v_end)
+    if dt < span:
+        y_end, v_end = state(motion, dt)
+    edge = piece.upper if direction > 0.0 else piece.lower
+    if (direction > 0.0 and y_end >= edge) or (direction < 0.0 and y_end < edge):
+        dt = root(motion, Watch(-edge, 0.0, 1.0, 0.0, 0.0), 0, 0.0, dt, direction > 0.0)
+        _, v_end = state(motion, dt)
+        return dt, edge, v_end
     if dt < span or direction * v_end <= 0.0:
         v_end = 0.0
-    return stuck + dt, y_end, v_end
+    return dt, y_end, v_end
+
+
+@compiled
+def _segment(
+    plant: Record, y: float, v: float, force: Force, remaining: float
+) -> tuple[float, float, float, bool]:
+    """Motion up to the next event, no longer than `remaining`: (duration, y, ẏ, wall acts)."""
+    piece, inside = piece_at(plant, y, v, force.constant)
+    stuck, motion, direction = onset(plant, piece, y, v, force, remaining)
+    if stuck >= remaining:
+        return remaining, y, v, inside
+    dt, y, v = slide(piece, motion, direction, remaining - stuck)
+    return stuck + dt, y, v, inside
+
+
+@compiled
+def passed(t: float, dt: float, duration: float) -> float:
+    """The time after an event; it never stands still, however short the event."""
+    if dt >= duration - t:
+        return duration
+    return t + dt if t + dt > t else t + _ROUNDING * duration
 
 
 @compiled
 def advance(
-    plant: Record, y: float, v: float, u0: float, u1: float, duration: float
+    plant: Record,
+    y: float,
+    v: float,
+    u0: float,
+    u1: float,
+    duration: float,
+    excess: float = 0.0,
+    rate: float = 0.0,
 ) -> tuple[float, float, bool]:
-    """State (y, ẏ) after `duration` under the external force u₀ + u₁·t, from (y, v).
+    """State (y, ẏ) after `duration` under u₀ + u₁·t − excess·(1 − exp(−rate·t)), from (y, v).
 
     plant is a record of dtype PLANT, y is measured from the wall (y < 0 inside). The third value
     tells whether the wall acted at any time. Coulomb friction is set-valued at rest: the handle
@@ -211,15 +311,13 @@ def advance(
     """
     t = 0.0
     touched = False
+    force = Force(u0, u1, excess, rate)
     for _ in range(MAX_EVENTS):
         if not t < duration:
             return y, v, touched
-        u = u0 + u1 * t
-        inside = _is_inside(plant, y, v, u - plant.spring * y)
+        dt, y, v, inside = _segment(plant, y, v, later(force, t), duration - t)
         touched = touched or inside
-        remaining = duration - t
-        dt, y, v = _segment(plant, y, v, u, u1, remaining, inside)
-        t = duration if dt >= remaining else t + dt
+        t = passed(t, dt, duration)
     return math.nan, math.nan, touched
 
 
@@ -230,9 +328,8 @@ def time_to_wall(plant: Record, y: float, v: float, u: float, duration: float) -
     Free motion under the constant force u, no friction: the one crossing that the sign change at
     the end of the interval vouches for.
     """
-    return _root(
-        _POSITION, plant.mass, plant.viscous, plant.spring, y, v, u, 0.0, 0.0, duration, False
-    )
+    motion = Smooth(plant.mass, plant.viscous, plant.spring, y, v, u, 0.0, 0.0, 0.0)
+    return root(motion, Watch(0.0, 0.0, 1.0, 0.0, 0.0), 0, 0.0, duration, False)
 
 
 #: Segments (of a quarter period each, at most) after which a contact is taken for one that does
@@ -249,8 +346,9 @@ def contact_end(plant: Record, y: float, v: float, u: float, horizon: float) -> 
     """
     t = 0.0
     entered = False
+    force = Force(u, 0.0, 0.0, 0.0)
     for _ in range(_CONTACT_SEGMENTS):
-        inside = _is_inside(plant, y, v, u - plant.spring * y)
+        _, inside = piece_at(plant, y, v, u)
         if entered and not inside:
             return t, v
         if not inside and t >= horizon:
@@ -262,7 +360,7 @@ def contact_end(plant: Record, y: float, v: float, u: float, horizon: float) -> 
             # A quarter period at a time; without a spring, as far ahead as was asked for.
             swings = plant.spring > 0.0 or plant.wall_stiffness > 0.0
             remaining = math.inf if swings else horizon
-        dt, y, v = _segment(plant, y, v, u, 0.0, remaining, inside)
+        dt, y, v, _ = _segment(plant, y, v, force, remaining)
         t += dt
         if inside and v == 0.0 and outward:
             break

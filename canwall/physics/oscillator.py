@@ -66,6 +66,62 @@ def basis(
 
 
 @compiled
+def lag_response(
+    damping_ratio: float, stiffness_ratio: float, rate: float, t: float
+) -> tuple[float, float, float, float, float, float]:
+    """(h', h, ∫h, ∬h, r', r): `basis`, and the response r to what a first-order lag leaves.
+
+    r'' + b/m·r' + k/m·r = exp(−rate·t) − 1 from rest; rate [1/s] is that of the lag. The same
+    series and the same doubling, so a lag as fast as the oscillator (resonance) is no case of its
+    own either.
+    """
+    doublings = 0
+    while (
+        abs(damping_ratio * t) + math.sqrt(abs(stiffness_ratio)) * abs(t) + abs(rate * t) > _REACH
+        and doublings < _MAX_DOUBLINGS
+    ):
+        t *= 0.5
+        doublings += 1
+    p = damping_ratio * t
+    q = stiffness_ratio * t * t
+    h1 = h0 = g1 = g2 = r1 = r0 = 0.0
+    term, following = 1.0, -p
+    # The lag's share of the series begins with its third term: c_3 = −rate·t.
+    power = -rate * t
+    lagged, lagging = power, power * power - p * power
+    for n in range(_TERMS):
+        h1 += term * _INVERSE_FACTORIALS[n]
+        h0 += term * _INVERSE_FACTORIALS[n + 1]
+        g1 += term * _INVERSE_FACTORIALS[n + 2]
+        g2 += term * _INVERSE_FACTORIALS[n + 3]
+        r1 += lagged * _INVERSE_FACTORIALS[n + 2]
+        r0 += lagged * _INVERSE_FACTORIALS[n + 3]
+        term, following = following, -p * following - q * term
+        power *= -rate * t
+        lagged, lagging = lagging, -p * lagging - q * lagged - rate * t * power
+    h0 *= t
+    g1 *= t * t
+    g2 *= t * t * t
+    r1 *= t
+    r0 *= t * t
+    gone = math.expm1(-rate * t)
+    for _ in range(doublings):
+        c = 1.0 - stiffness_ratio * g1
+        # After t the lag's share goes on as it began, smaller by what is gone, and what is gone
+        # acts as a constant.
+        r1, r0 = (
+            (h1 + 1.0 + gone) * r1 - stiffness_ratio * h0 * r0 + gone * h0,
+            (c + 1.0 + gone) * r0 + h0 * r1 + gone * g1,
+        )
+        gone *= gone + 2.0
+        g2 = c * g2 + h0 * g1 + t * g1 + g2
+        g1 = c * g1 + h0 * h0 + g1
+        h1, h0 = h1 * h1 - stiffness_ratio * h0 * h0, c * h0 + h0 * h1
+        t *= 2.0
+    return h1, h0, g1, g2, r1, r0
+
+
+@compiled
 def flow(
     mass: float,
     viscous: float,

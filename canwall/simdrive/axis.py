@@ -256,16 +256,8 @@ class Axis:
             self._reached = self._reached and sloped
         else:
             self._slope_torque = 0.0
-            self._produce = (
-                self._follow_target
-                if self._follows_target
-                else self._brake
-                if self._ramp and self._slow_down.braking
-                else None
-            )
             self._reached = self._slow_down.done
-            if self._produce is None:
-                self._torque.off()
+            self._produce = self._torque_without_slope()
         self._homes = operating and mode == HOMING
         if self._homes:
             self._homing.control(self._controlword.value)
@@ -274,6 +266,15 @@ class Axis:
         if self._emcy.latched and not machine.faulty:
             self._emcy.acknowledge()
         self._show_status()
+
+    def _torque_without_slope(self) -> Callable[[float], None] | None:
+        if self._follows_target:
+            return self._follow_target
+        braking = self._ramp is not None and self._slow_down.braking
+        if not braking or not self._slow_down.begun:
+            # Before the controller begins to brake, the master's torque is gone.
+            self._torque.off()
+        return self._brake if braking else None
 
     def _slow(self, ramp: Ramp | None, mode: int) -> None:
         """Begin to slow down, or go on, or (None) end it."""

@@ -1,15 +1,20 @@
 """A simulated drive from `[drive]` (its dictionary) and `[simulation]` (its mechanics)."""
 
 import math
+from collections.abc import Callable
 
 from canwall.config import Drive as DriveSettings
 from canwall.config import Simulation
 from canwall.simdrive.dictionary import Dictionary
 from canwall.simdrive.drive import DEFAULT_BITRATE, SimulatedDrive
+from canwall.simdrive.faults import FaultyDrive, FaultyEncoder, planned
 from canwall.simdrive.hardware import Hardware
 from canwall.simdrive.memory import UNCONFIGURED, Memory
 from canwall.simdrive.motion import ServoMotion
 from canwall.simdrive.position_unit import quotient
+
+_SERVO_DRIVE = 0x20192
+"""Device type: profile 402, servo drive."""
 
 
 def make_drive(
@@ -17,17 +22,20 @@ def make_drive(
     simulation: Simulation,
     sync_period_s: float,
     bitrate: int = DEFAULT_BITRATE,
-) -> SimulatedDrive:
+    report: Callable[[str], None] = lambda line: None,
+) -> FaultyDrive:
     """The drive that the configuration describes, not yet switched on.
 
     Rated torque and encoder are those of its dictionary (0x6076, 0x608F, 0x6091), and those of
     the simulation where the dictionary has none, or an encoder of 1/1. A node-ID that LSS has
     stored goes first.
-    `bitrate` [bit/s] is that of the bus. Raises DictionaryError.
+    `bitrate` [bit/s] is that of the bus; report is told in a line when a fault begins or ends.
+    Raises DictionaryError.
     """
     memory = Memory(simulation.store)
     node_id = memory.node_id or drive.node_id
     dictionary = Dictionary.load(drive.eds, drive.node_id if node_id == UNCONFIGURED else node_id)
+    dictionary.supply(0x1000, 0, _SERVO_DRIVE)
     dictionary.supply(0x6076, 0, round(1000.0 * simulation.rated_torque_nm))
     dictionary.supply(0x608F, 1, simulation.counts_per_rev)
     for unit in ((0x608F, 2), (0x6091, 1), (0x6091, 2)):
@@ -36,12 +44,12 @@ def make_drive(
     # What the encoder has, whatever unit the drive shows. 1/1 says as little as nothing.
     resolution = quotient(dictionary, 0x608F)
     counts = (simulation.counts_per_rev if resolution == 1.0 else resolution) * gear_ratio
-    motion = ServoMotion(simulation, sync_period_s, counts)
+    encoder = FaultyEncoder(ServoMotion(simulation, sync_period_s, counts))
     hardware = _hardware(simulation, counts / (2.0 * math.pi), gear_ratio)
-    return SimulatedDrive(
+    simulated = SimulatedDrive(
         dictionary,
         node_id,
-        motion,
+        encoder,
         sync_period_s,
         memory,
         bitrate,
@@ -49,6 +57,8 @@ def make_drive(
         simulation.real_time,
         hardware,
     )
+    faults = [planned(fault, sync_period_s, simulation.real_time) for fault in simulation.fault]
+    return FaultyDrive(simulated, encoder, faults, simulation.seed, report)
 
 
 def _hardware(simulation: Simulation, counts_per_rad: float, gear_ratio: float) -> Hardware:

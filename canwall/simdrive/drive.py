@@ -8,8 +8,13 @@ from canwall.simdrive import lss, nmt, rpdo, tpdo
 from canwall.simdrive.actuator import Actuator
 from canwall.simdrive.axis import Axis, Motion
 from canwall.simdrive.dictionary import Dictionary, Key
-from canwall.simdrive.emcy import COMMUNICATION, HEARTBEAT_LOST, EmergencyProducer
-from canwall.simdrive.error_behaviour import ErrorBehaviour
+from canwall.simdrive.emcy import (
+    COMMUNICATION,
+    HEARTBEAT_LOST,
+    RECOVERED_FROM_BUS_OFF,
+    EmergencyProducer,
+)
+from canwall.simdrive.error_behaviour import ERROR_BEHAVIOUR, ErrorBehaviour
 from canwall.simdrive.frame import NS_PER_MS, Clock, Frame
 from canwall.simdrive.guarding import NodeGuarding
 from canwall.simdrive.hardware import Hardware
@@ -88,12 +93,16 @@ class SimulatedDrive:
         self._bitrate = bitrate
         self.real_time = real_time
         """Whether the physics move by the time that ``tick`` tells, not by the count of SYNCs."""
-        self._sync_is_time = False
+        self.syncs = 0
+        """How many SYNCs have been on the bus."""
+        self.passes_syncs = True
+        """Whether a SYNC that arrives is one on the bus; False: ``pass_sync`` tells of those."""
         self._passed_s = 0.0
         """Time that the slope of the torque (0x6087) has not been told of."""
         self._without_sync_s = 0.0
         """Time since the last SYNC, or since then and a slow-down going on without it."""
         self._hardware = hardware or Hardware()
+        self._extensions: list[Callable[[Dictionary], None]] = []
         self._build(dictionary, node_id)
 
     def _build(self, dictionary: Dictionary, node_id: int) -> None:
@@ -145,12 +154,65 @@ class SimulatedDrive:
         )
         self._nmt = NmtSlave(dictionary.node_id, self._leaving, self._entered, self._reset)
         self._error_behaviour = ErrorBehaviour(dictionary, self._nmt)
+        for serve in self._extensions:
+            serve(dictionary)
         self._route()
+
+    @property
+    def axis(self) -> Axis:
+        """The CiA 402 side of the drive."""
+        return self._axis
+
+    @property
+    def actuator(self) -> Actuator:
+        """The way of the torque to the motion."""
+        return self._actuator
+
+    @property
+    def emcy(self) -> EmergencyProducer:
+        """The errors that are present."""
+        return self._emcy
+
+    @property
+    def sync_period_s(self) -> float:
+        """Time from one SYNC to the next, in seconds."""
+        return self._sync_period_s
+
+    @property
+    def sync_can_id(self) -> int:
+        """CAN-ID of the SYNC that the drive hears (0x1005)."""
+        return self._sync.can_id
+
+    def extend(self, serve: Callable[[Dictionary], None]) -> None:
+        """Let somebody else serve objects of the dictionary as well.
+
+        Args:
+            serve: called now, and again with every dictionary that takes the place of this one.
+        """
+        self._extensions.append(serve)
+        serve(self._dictionary)
+
+    def switch_off(self) -> None:
+        """Take the supply away: the drive is dead until ``boot``."""
+        self._axis.disable()
+        self._nmt.state = NmtState.INITIALISATION
+        self._route()
+        self._outbox.clear()
+
+    def bus_off(self) -> None:
+        """React to a controller that has left the bus (0x6007 and 0x1029)."""
+        self._axis.abort_connection(COMMUNICATION, _ABORT_CONNECTION)
+        self._error_behaviour.communication_error()
+
+    def bus_recovered(self) -> None:
+        """Tell that the controller is back on the bus."""
+        self._emcy.occurred(RECOVERED_FROM_BUS_OFF, ERROR_BEHAVIOUR)
+        self._emcy.gone(RECOVERED_FROM_BUS_OFF, ERROR_BEHAVIOUR)
 
     def boot(self) -> list[Frame]:
         """Switch the device on: power-on values, boot-up message, PRE-OPERATIONAL."""
         self._reset(communication_only=False)
-        return self._take_outbox()
+        return self.take_outbox()
 
     def process(self, can_id: int, data: bytes) -> list[Frame]:
         """Take a frame from the bus and return the frames that it makes the drive send.
@@ -165,14 +227,14 @@ class SimulatedDrive:
         receive(data)
         for transmitted in self._event_tpdos:
             transmitted.poll()
-        return self._take_outbox()
+        return self.take_outbox()
 
     def request(self, can_id: int) -> list[Frame]:
         """Take a remote frame (11-bit identifier) and return the frames that answer it."""
         respond = self._remote_routes.get(can_id)
         if respond is not None:
             respond()
-        return self._take_outbox()
+        return self.take_outbox()
 
     def tick(self, dt: float) -> list[Frame]:
         """Let the protocol timers go on by ``dt`` seconds; return the frames that are due."""
@@ -193,9 +255,10 @@ class SimulatedDrive:
                 received.tick()
             for transmitted in self._event_tpdos:
                 transmitted.poll()
-        return self._take_outbox()
+        return self.take_outbox()
 
-    def _take_outbox(self) -> list[Frame]:
+    def take_outbox(self) -> list[Frame]:
+        """Return the frames that what was done to the drive makes it send."""
         if not self._outbox:
             return []
         frames = self._outbox.copy()
@@ -252,6 +315,18 @@ class SimulatedDrive:
         actuator.advance(self._axis.torque_nm, periods)
         self._passed_s += periods * self._sync_period_s
 
+    def pass_sync(self) -> None:
+        """Let the world go on to a SYNC on the bus, whether the drive hears it or not."""
+        self.syncs += 1
+        self._without_sync_s = 0.0
+        if self.real_time:
+            return
+        if self.syncs > 1:
+            self._pass(1.0)
+        else:
+            # Before the first SYNC there is no period, but the first step of a slope is due.
+            self._passed_s = self._sync_period_s
+
     def _apply_torque(self) -> None:
         """Let the target torque hold from now on."""
         self._axis.apply_torque(self._passed_s)
@@ -273,13 +348,8 @@ class SimulatedDrive:
             self._axis.sample()
 
     def _on_sync(self, data: bytes) -> None:
-        self._without_sync_s = 0.0
-        if self._sync_is_time:
-            self._pass(1.0)
-        elif not self.real_time:
-            # Before the first SYNC there is no period, but the first step of a slope is due.
-            self._sync_is_time = True
-            self._passed_s = self._sync_period_s
+        if self.passes_syncs:
+            self.pass_sync()
         if not self._sync.receive(data):
             return
         self._axis.state_machine.step()

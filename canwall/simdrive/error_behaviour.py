@@ -1,9 +1,11 @@
 """Error behaviour (CiA 301, 7.5.2.32): the NMT state that a lost connection leads to."""
 
-from canwall.simdrive.dictionary import Dictionary
+from canwall.simdrive.dictionary import Dictionary, Key
 from canwall.simdrive.nmt import NmtSlave, NmtState
 
 _REACTIONS = range(3)
+ERROR_BEHAVIOUR: Key = (0x1029, 1)
+
 _PRE_OPERATIONAL, _NO_CHANGE, _STOPPED = _REACTIONS
 
 
@@ -16,7 +18,7 @@ class ErrorBehaviour:
     def __init__(self, dictionary: Dictionary, nmt: NmtSlave) -> None:
         """Args: dictionary: has the entry; nmt: the state that changes."""
         self._nmt = nmt
-        self._class = dictionary.number(0x1029, 1, absent=_PRE_OPERATIONAL)
+        self._class = dictionary.number(*ERROR_BEHAVIOUR, absent=_PRE_OPERATIONAL)
         for subindex in range(1, 255):
             if (0x1029, subindex) in dictionary:
                 dictionary.number(0x1029, subindex, absent=_NO_CHANGE).allow(_REACTIONS)

@@ -2,15 +2,39 @@
 
 import time
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, Protocol
 
 import can
 
-from canwall.simdrive.drive import SimulatedDrive
-from canwall.simdrive.frame import Frame
+from canwall.simdrive.frame import ERROR_FRAME, Frame
 
 _TICK_S = 0.001
 """Least time between ticks, and longest wait for a frame."""
+
+
+class Device(Protocol):
+    """What lives on a bus: frames in, frames out, and time."""
+
+    @property
+    def real_time(self) -> bool:
+        """Whether it is to know of the time at which each frame comes."""
+        ...
+
+    def boot(self) -> list[Frame]:
+        """Switch the device on."""
+        ...
+
+    def process(self, can_id: int, data: bytes) -> list[Frame]:
+        """Take a data frame (11-bit identifier) and return the answers."""
+        ...
+
+    def request(self, can_id: int) -> list[Frame]:
+        """Take a remote frame and return the answers."""
+        ...
+
+    def tick(self, dt: float) -> list[Frame]:
+        """Let ``dt`` seconds pass and return the frames that are due."""
+        ...
 
 
 class _DataFrame(can.Message):
@@ -37,9 +61,10 @@ class BusRunner:
 
     def __init__(
         self,
-        drive: SimulatedDrive,
+        drive: Device,
         bus: can.BusABC,
         clock: Callable[[], float] = time.monotonic,
+        error_frames: bool = True,
     ) -> None:
         """Switch the drive on: its boot-up message goes onto the bus.
 
@@ -47,6 +72,8 @@ class BusRunner:
             drive: not yet switched on.
             bus: where it lives; stays the caller's to shut down.
             clock: tells the time in seconds.
+            error_frames: whether the bus takes error frames. A real controller makes its own, and
+                sends as data what it is given.
 
         Raises:
             can.CanError: the bus does not take the message.
@@ -54,6 +81,7 @@ class BusRunner:
         self._drive = drive
         self._bus = bus
         self._clock = clock
+        self._error_frames = error_frames
         self._last_tick_s = clock()
         self._send(drive.boot())
 
@@ -98,4 +126,14 @@ class BusRunner:
 
     def _send(self, frames: Iterable[Frame]) -> None:
         for can_id, data in frames:
-            self._bus.send(_DataFrame(can_id, data))
+            if not can_id & ERROR_FRAME:
+                self._bus.send(_DataFrame(can_id, data))
+            elif self._error_frames:
+                self._bus.send(
+                    can.Message(
+                        arbitration_id=can_id & ~ERROR_FRAME,
+                        is_error_frame=True,
+                        is_extended_id=False,
+                        data=data,
+                    )
+                )

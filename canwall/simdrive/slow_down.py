@@ -52,7 +52,8 @@ class SlowDown:
         }
         self._period_s = period_s
         self._free = True
-        self._begun = False
+        self.begun = False
+        """Whether the controller has given a torque."""
         self._rate = 0.0
         self._reference = 0.0
         self._integral = 0.0
@@ -68,7 +69,7 @@ class SlowDown:
     def begin(self, ramp: Ramp) -> None:
         """Begin to brake from the present velocity."""
         speed = self._feedback.speed_rad_s()
-        self._begun = False
+        self.begun = False
         self._integral = self._standing_s = 0.0
         if ramp is Ramp.CURRENT_LIMIT:
             self._rate = self._reference = 0.0
@@ -87,8 +88,8 @@ class SlowDown:
             passed_s: time since the last call, in seconds; with the first call it begins.
             limit_nm: magnitude of the torque at the shaft that there is.
         """
-        if not self._begun:
-            self._begun, passed_s = True, 0.0
+        if not self.begun:
+            self.begun, passed_s = True, 0.0
         reference = self._reference = _towards_zero(self._reference, self._rate * passed_s)
         speed = self._feedback.speed_rad_s()
         if reference == 0.0:

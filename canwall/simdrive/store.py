@@ -22,8 +22,9 @@ _GROUPS = {
 _MANUFACTURER = range(0x2000, 0x6000)
 """What every further sub-index is for."""
 
-_NOT_PARAMETERS = frozenset((0x1003, _STORE, _RESTORE, 0x6040, 0x6071))
-"""History, commands and targets: whatever was stored, nothing moves by itself after power-on."""
+_NOT_PARAMETERS = frozenset((0x1003, _STORE, _RESTORE, 0x5F00, 0x6040, 0x6071))
+"""History, commands, faults asked for and targets: whatever was stored, nothing moves by itself
+after power-on."""
 
 
 class ParameterStore:

@@ -453,3 +453,12 @@ def test_exception_of_the_program_itself_ends_in_order(make_rig: RigFactory) -> 
     assert steps([word for word, _ in loop.rig.rpdos()])[-3:] == DOWN
     assert loop.rig.rpdos()[-1] == (0x00, 0)
     assert loop.rig.node.read(0x6041) & 0x6F == 0x40
+
+
+def test_lost_tpdos_are_those_that_the_simulation_loses(make_rig: RigFactory) -> None:
+    fault = {"kind": "lost", "can_id": TPDO1, "at_sync": 50, "duration_syncs": 1}
+    loop = Loop(make_rig(settings_with({"simulation.fault": [fault]})))
+    assert loop.run(100).trips == []
+    rows = loop.rows()
+    assert rows["j"][~rows["received"].astype(bool)].tolist() == [50]
+    assert loop.record["missed_tpdo"][0] == 1

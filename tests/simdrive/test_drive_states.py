@@ -110,11 +110,11 @@ def test_option_codes_take_what_they_serve(bench: Bench, index: int, served: set
 
 
 def test_mode_of_operation(bench: Bench) -> None:
-    assert bench.read(0x6502) == 1 << 9 | 1 << 3
+    assert bench.read(0x6502) == 1 << 9 | 1 << 5 | 1 << 3
     assert bench.read(0x6061) == 0
     bench.write(0x6060, 0, 10, 1)
     assert bench.read(0x6061) == 10
-    for mode in (-1, 1, 3, 8, 9, 11):
+    for mode in (-1, 1, 3, 5, 7, 8, 9, 11):
         with pytest.raises(SdoAbortedError, match="06090030"):
             bench.write(0x6060, 0, mode, 1)
     assert bench.read(0x6061) == 10

@@ -48,6 +48,7 @@ SERVED: dict[int, set[AbortCode]] = {
     0x1016: {INVALID},
     0x1019: {INVALID, DEVICE_STATE},  # not while there is a cycle period
     0x1029: {INVALID},
+    0x5F00: {DEVICE_STATE},  # begins only what the other sub-indices describe
     0x6007: {INVALID},
     0x605A: {INVALID},
     0x605B: {INVALID},

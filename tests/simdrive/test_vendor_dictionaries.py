@@ -85,7 +85,7 @@ def test_is_enabled_and_driven(vendor: Vendor, of_vendor: ConfiguredBench) -> No
     configure(bench, 0x1400, RPDO[1], [CONTROLWORD, TARGET_TORQUE])
     configure(bench, 0x1800, NO_RTR | TPDO[1], [STATUSWORD, POSITION])
     bench.nmt(START)
-    for mode in vendor.torque_modes:
+    for mode in vendor.modes:
         torque = 50
         bench.write(0x6060, 0, mode, 1)
         assert bench.read(0x6061) == mode
@@ -114,13 +114,13 @@ def test_modes_without_torque_are_refused(of_vendor: ConfiguredBench, mode: int)
 def test_supported_modes_are_shown(vendor: Vendor, of_vendor: ConfiguredBench) -> None:
     shown = of_vendor.read(0x6502)
     if load_eds(of_vendor.path, NODE_ID)[0x6502].default is None:
-        assert shown == sum(1 << mode - 1 for mode in (*vendor.torque_modes, 6))
+        assert shown == sum(1 << mode - 1 for mode in (*vendor.modes, 6))
 
 
 def test_units(vendor: Vendor, of_vendor: ConfiguredBench, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = of_vendor
     torques: list[float] = []
-    motion = bench.drive._motion
+    motion = bench.drive.drive._motion
     monkeypatch.setattr(motion, "advance", lambda torque_nm, _: torques.append(torque_nm))
     bench.enable()
     bench.write(0x6071, 0, 100, 2)

@@ -15,10 +15,10 @@ FOLDER = Path(__file__).parents[3] / "shared" / "vendor-eds"
 
 @dataclass(frozen=True)
 class Vendor:
-    """A file, and what its drive is to be like; each has homing beside its torque modes."""
+    """A file, and what its drive is to be like: torque modes (each has homing beside them)."""
 
     file: str
-    torque_modes: tuple[int, ...]
+    modes: tuple[int, ...]
     lacks: tuple[int, ...]
     rated_torque_mnm: float
     counts_per_rev: float

@@ -1,0 +1,178 @@
+"""The doctor: finds the drive, says how it would be set up and why, and tests its watchdog.
+
+The drive is set up as for a run, enabled with zero torque for the test, disabled, and everything
+that was changed is put back.
+"""
+
+import contextlib
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from canwall.config import Settings
+from canwall.drive import DriveError, DriveNode, DriveSetup, Link, PdoLayout, set_up
+from canwall.drive import objects as od
+from canwall.drive.cia402 import State, state_of, status_text
+from canwall.drive.trial import Trial
+from canwall.eds import load_eds
+from canwall.errors import RunFailedError
+
+#: Seconds of a living master before it falls silent: some drives watch from the second sign on.
+_ALIVE_S = 0.2
+#: Beyond its time by this much, the watchdog is taken for one that does not work.
+_LATE_S = 0.5
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line: of what, what was found, and whether all is well with it."""
+
+    section: str
+    what: str
+    found: str
+    well: bool = True
+
+
+@dataclass
+class Findings:
+    """What the doctor found, in order."""
+
+    lines: list[Finding] = field(default_factory=list)
+
+    @property
+    def well(self) -> bool:
+        """Whether a run may be tried."""
+        return all(line.well for line in self.lines)
+
+    def add(self, section: str, what: str, found: str, well: bool = True) -> None:
+        """Note one finding."""
+        self.lines.append(Finding(section, what, found, well))
+
+
+def examine(
+    link: Link,
+    settings: Settings,
+    required: tuple[int, ...],
+    announce: Callable[[str], None],
+    findings: Findings,
+) -> None:
+    """Fill the findings; announce is told what is about to be done to the drive.
+
+    Whatever happens, torque is zero, the drive is disabled and put back at the end. Raises
+    DriveError where the drive cannot be set up or does not follow, can.CanError.
+    """
+    dictionary = load_eds(settings.drive.eds, settings.drive.node_id, required)
+    node = DriveNode(link, settings.drive.node_id, dictionary)
+    try:
+        announce("setting the drive up; nothing is enabled")
+        # In doubt the doctor goes on: that there is no watchdog is a finding, not an end.
+        lenient = settings.drive.model_copy(update={"accept_no_watchdog": True})
+        setup = set_up(node, lenient, settings.bus, real_time=True)
+        _describe(setup, settings, findings)
+        _test(node, setup, settings, announce, findings)
+    finally:
+        announce("putting the drive back as it was")
+        failures = node.restore()
+        for failure in failures:
+            findings.add("put back", "not done", failure, well=False)
+        if not failures:
+            findings.add("put back", "changes", "all undone; nothing was stored")
+
+
+def _describe(setup: DriveSetup, settings: Settings, findings: Findings) -> None:
+    findings.add("identity", "0x1000, 0x1018", str(setup.identity))
+    findings.add("mode", "0x6060", str(setup.mode))
+    if setup.scales is not None:
+        for found, whence in setup.scales.sources:
+            findings.add("units", whence, found)
+    enough = setup.torque_limit_nm >= settings.limits.torque_nm
+    if not enough:
+        findings.add(
+            "units",
+            "limits.torque_nm",
+            f"{settings.limits.torque_nm:g} N·m is more than the drive gives",
+            well=False,
+        )
+    findings.add("PDO", "TPDO, with every SYNC", _shown(setup.tpdo))
+    effect = "at the next SYNC" if setup.synchronous else "on reception"
+    findings.add("PDO", f"RPDO, effective {effect}", _shown(setup.rpdo))
+    findings.add("PDO", "SYNC", f"{setup.sync_cob_id:#x}")
+    for note in setup.notes:
+        findings.add("notes", "drive", note)
+    watchdog = setup.watchdog
+    present = watchdog.kind != "none"
+    findings.add(
+        "watchdog", "set", str(watchdog), well=present or settings.drive.accept_no_watchdog
+    )
+    for passed_over in watchdog.passed_over:
+        findings.add("watchdog", "passed over", passed_over)
+
+
+def _shown(pdo: PdoLayout) -> str:
+    return f"{pdo.cob_id:#x}: {', '.join(str(field) for field in pdo.fields)}"
+
+
+def _test(
+    node: DriveNode,
+    setup: DriveSetup,
+    settings: Settings,
+    announce: Callable[[str], None],
+    findings: Findings,
+) -> None:
+    """Enable with zero torque, fall silent, and watch the drive let go."""
+    trial = Trial(node, setup, settings.bus.cycle_s)
+    announce("enabling the drive with zero torque: keep clear of the handle")
+    try:
+        trial.enable()
+        findings.add("enabling", "0x6041", "OPERATION ENABLED with zero torque")
+        if setup.watchdog.kind != "none":
+            _fall_silent(node, setup, trial, announce, findings)
+        trial.disable()
+    except BaseException:
+        # The cycle may be what does not work, or somebody lost patience; SDO gets through.
+        with contextlib.suppress(DriveError):
+            node.write(od.TARGET_TORQUE, 0, 0)
+            node.write(od.CONTROLWORD, 0, 0)
+        raise
+
+
+def _fall_silent(
+    node: DriveNode,
+    setup: DriveSetup,
+    trial: Trial,
+    announce: Callable[[str], None],
+    findings: Findings,
+) -> None:
+    watchdog = setup.watchdog
+    alive_until = time.monotonic() + max(_ALIVE_S, 2.0 * watchdog.time_s)
+    while time.monotonic() < alive_until:
+        statusword = trial.cycle(0x0F)
+        if statusword is not None and state_of(statusword) is not State.OPERATION_ENABLED:
+            raise RunFailedError(
+                f"node {node.node_id} went to {status_text(statusword)} while its master was "
+                f"alive: drive.watchdog_s = {watchdog.time_s:g} may be too short for this machine"
+            )
+    announce(f"falling silent, as a dead master would: {watchdog.kind}")
+    give_up = trial.last_sign_of_life + watchdog.time_s + _LATE_S
+    while True:
+        statusword = node.read(od.STATUSWORD)
+        seen = time.monotonic()
+        if state_of(statusword) is not State.OPERATION_ENABLED:
+            break
+        if seen >= give_up:
+            findings.add(
+                "watchdog",
+                "tested",
+                f"no reaction within {seen - trial.last_sign_of_life:.3f} s: the drive stays in "
+                f"{status_text(statusword)}",
+                well=False,
+            )
+            return
+    findings.add(
+        "watchdog",
+        "tested",
+        f"{status_text(statusword)} {(seen - trial.last_sign_of_life) * 1e3:.0f} ms after the "
+        f"last sign of life",
+    )
+    # What 0x1029 makes of it may be another NMT state, without PDOs.
+    node.command("OPERATIONAL")

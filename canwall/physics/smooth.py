@@ -1,0 +1,214 @@
+"""Motion between two events: a linear oscillator under a ramp and what a first-order lag leaves.
+
+And the search for the next event. Newton's iteration finds a root in a bracket; that no root is
+missed, and none found twice, is a matter of brackets on which the function is monotone. They are
+the zeros of its derivative, which has brackets of its own, down to a function whose zeros can be
+counted: once the derivatives have removed the ramp and (D + rate) the lag, what is left of any
+function of position, velocity and acceleration is a damped oscillation, with one zero at the most
+within a quarter of its period.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from canwall.compiled import compiled
+from canwall.physics.oscillator import flow, lag_response
+
+_MAX_ITERATIONS = 200
+
+
+class Force(NamedTuple):
+    """constant + slope·t − excess·(1 − exp(−rate·t)): the excess dies away at `rate` [1/s].
+
+    A current loop of first order delivers such a torque: it starts at `constant` and ends at the
+    demand, constant − excess.
+    """
+
+    constant: float
+    slope: float
+    excess: float
+    rate: float
+
+
+class Smooth(NamedTuple):
+    """mass·ÿ + viscous·ẏ + spring·y = F(t) from (y, v), with F as in `Force`; spring of any sign.
+
+    What is constant between two events, friction above all, is in `constant`.
+    """
+
+    mass: float
+    viscous: float
+    spring: float
+    y: float
+    v: float
+    constant: float
+    slope: float
+    excess: float
+    rate: float
+
+
+class Watch(NamedTuple):
+    """constant + slope·t + position·y + velocity·ẏ + acceleration·ÿ: events are its zeros."""
+
+    constant: float
+    slope: float
+    position: float
+    velocity: float
+    acceleration: float
+
+
+VELOCITY = Watch(0.0, 0.0, 0.0, 1.0, 0.0)
+ACCELERATION = Watch(0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+@compiled
+def later(force: Force, t: float) -> Force:
+    """The same force, seen from t on."""
+    constant = force.constant + force.slope * t
+    if force.excess == 0.0:
+        return Force(constant, force.slope, 0.0, force.rate)
+    gone = -math.expm1(-force.rate * t) * force.excess
+    return Force(constant - gone, force.slope, force.excess - gone, force.rate)
+
+
+@compiled
+def _lagged_state(motion: Smooth, t: float) -> tuple[float, float]:
+    m = motion
+    kappa = m.spring / m.mass
+    h1, h0, g1, g2, r1, r0 = lag_response(m.viscous / m.mass, kappa, m.rate, t)
+    a0 = (m.constant - m.spring * m.y) / m.mass
+    a1 = m.slope / m.mass
+    lag = m.excess / m.mass
+    return (
+        m.y + m.v * h0 + a0 * g1 + a1 * g2 + lag * r0,
+        m.v * h1 + a0 * h0 + a1 * g1 + lag * r1,
+    )
+
+
+@compiled
+def state(motion: Smooth, t: float) -> tuple[float, float]:
+    """(y, ẏ) at time t."""
+    m = motion
+    if m.excess == 0.0:
+        return flow(m.mass, m.viscous, m.spring, m.y, m.v, m.constant, m.slope, t)
+    return _lagged_state(motion, t)
+
+
+@compiled
+def departure(motion: Smooth, t: float) -> tuple[float, float]:
+    """(y − y(0) − ẏ(0)·t, ẏ − ẏ(0)) at time t, precise to the last bit however small t is."""
+    m = motion
+    _, h0, g1, g2, r1, r0 = lag_response(m.viscous / m.mass, m.spring / m.mass, m.rate, t)
+    a0 = (m.constant - m.viscous * m.v - m.spring * m.y) / m.mass
+    a1 = (m.slope - m.spring * m.v) / m.mass
+    lag = m.excess / m.mass
+    return a0 * g1 + a1 * g2 + lag * r0, a0 * h0 + a1 * g1 + lag * r1
+
+
+@compiled
+def largest_acceleration(motion: Smooth, span: float) -> float:
+    """A bound of |ÿ| over [0, span].
+
+    ÿ = ÿ(0)·h' + (slope − spring·ẏ(0))/m·h + the lag's share, with |h'| ≤ 1 for an oscillator,
+    ≤ cosh for a negative spring, |h| no more than its integral, and the lag's share no more than
+    what of it has gone.
+    """
+    m = motion
+    growth = math.cosh(math.sqrt(max(-m.spring / m.mass, 0.0)) * span)
+    a0 = abs(m.constant - m.viscous * m.v - m.spring * m.y)
+    a1 = abs(m.slope - m.spring * m.v) * span
+    lag = abs(m.excess) * -math.expm1(-m.rate * span)
+    return growth * (a0 + a1 + lag) / m.mass
+
+
+@compiled
+def watched(motion: Smooth, watch: Watch, order: int, t: float) -> tuple[float, float]:
+    """A watched function, differentiated `order` times, and its slope, at time t.
+
+    Order 3 stands for (D + rate)·D², which leaves a damped oscillation of everything.
+    """
+    m = motion
+    w = watch
+    y0, y1 = state(m, t)
+    left = m.excess * math.exp(-m.rate * t) if m.excess != 0.0 else 0.0
+    force = m.constant + m.slope * t
+    if m.excess != 0.0:
+        force -= m.excess - left
+    y2 = (force - m.viscous * y1 - m.spring * y0) / m.mass
+    left *= -m.rate
+    y3 = (m.slope + left - m.viscous * y2 - m.spring * y1) / m.mass
+    value = w.position * y0 + w.velocity * y1 + w.acceleration * y2
+    first = w.position * y1 + w.velocity * y2 + w.acceleration * y3
+    if order == 0:
+        return w.constant + w.slope * t + value, w.slope + first
+    left *= -m.rate
+    y4 = (left - m.viscous * y3 - m.spring * y2) / m.mass
+    second = w.position * y2 + w.velocity * y3 + w.acceleration * y4
+    if order == 1:
+        return w.slope + first, second
+    left *= -m.rate
+    y5 = (left - m.viscous * y4 - m.spring * y3) / m.mass
+    third = w.position * y3 + w.velocity * y4 + w.acceleration * y5
+    if order == 2:
+        return second, third
+    left *= -m.rate
+    y6 = (left - m.viscous * y5 - m.spring * y4) / m.mass
+    fourth = w.position * y4 + w.velocity * y5 + w.acceleration * y6
+    return third + m.rate * second, fourth + m.rate * third
+
+
+@compiled
+def root(motion: Smooth, watch: Watch, order: int, low: float, high: float, rising: bool) -> float:
+    """The root of a watched function in (low, high]: Newton kept in its bracket."""
+    rounding = 4e-16 * high
+    t = 0.5 * (low + high)
+    for _ in range(_MAX_ITERATIONS):
+        value, slope = watched(motion, watch, order, t)
+        if (value < 0.0) == rising:
+            low = t
+        else:
+            high = t
+        step = value / slope if slope != 0.0 else math.inf
+        if abs(step) <= rounding:
+            return t
+        proposal = t - step
+        if not low < proposal < high:
+            proposal = 0.5 * (low + high)
+        if abs(proposal - t) <= rounding or proposal in (low, high):
+            return proposal
+        t = proposal
+    return t
+
+
+@compiled
+def first_turn(motion: Smooth, watch: Watch, sign: float, span: float) -> float:
+    """First time in (0, span] at which a watched function has turned against `sign`, else inf.
+
+    span is at most a quarter period of the oscillator.
+    """
+    edges = np.empty(6)
+    zeros = np.empty(6)
+    edges[0], edges[1] = 0.0, span
+    count = 2
+    for order in range(3 if motion.excess != 0.0 else 2, -1, -1):
+        # Of two edges between which the sign changes, the next lower order has its one zero there.
+        zeros[0] = 0.0
+        found = 1
+        before = sign if order == 0 else watched(motion, watch, order, 0.0)[0]
+        since = 0.0
+        for i in range(1, count):
+            value, _ = watched(motion, watch, order, edges[i])
+            if value * before < 0.0:
+                zero = root(motion, watch, order, since, edges[i], before < 0.0)
+                if order == 0:
+                    return zero
+                zeros[found] = zero
+                found += 1
+            if value != 0.0:
+                before, since = value, edges[i]
+        zeros[found] = span
+        count = found + 1
+        edges, zeros = zeros, edges
+    return math.inf

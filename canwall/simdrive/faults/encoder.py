@@ -1,0 +1,51 @@
+"""An encoder that jumps or sticks, before the one of the motion."""
+
+from collections.abc import Callable
+from typing import Protocol
+
+from canwall.simdrive.axis import Motion
+
+
+class Advance(Protocol):
+    """Moves on by ``duration_s`` under a torque."""
+
+    def __call__(self, torque_nm: float, duration_s: float) -> None:
+        """Move on."""
+        ...
+
+
+class FaultyEncoder:
+    """Reads the motion, with an offset, or not at all any more.
+
+    While nothing is wrong, what the drive calls are the methods of the motion themselves.
+    """
+
+    counts: Callable[[], int]
+    speed_counts_per_s: Callable[[], float]
+    advance: Advance
+
+    def __init__(self, motion: Motion) -> None:
+        """Read truly at first."""
+        self._motion = motion
+        self.advance = motion.advance
+        self._offset = 0
+        self.release()
+
+    def jump(self, increments: int) -> None:
+        """Read so many increments more from now on."""
+        self._offset += increments
+        self.counts = self._counts if self._offset else self._motion.counts
+
+    def stick(self) -> None:
+        """Read the present position from now on, and no speed."""
+        stuck_at = self.counts()
+        self.counts = lambda: stuck_at
+        self.speed_counts_per_s = float
+
+    def release(self) -> None:
+        """Read the motion again."""
+        self.speed_counts_per_s = self._motion.speed_counts_per_s
+        self.jump(0)
+
+    def _counts(self) -> int:
+        return self._motion.counts() + self._offset
