@@ -122,6 +122,23 @@ def _run_settings(path: Path, overrides: dict[str, Any]) -> Settings:
 
 
 @app.command()
+def change(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run that goes on.")],
+    assignments: Annotated[
+        list[str],
+        typer.Argument(metavar="KEY=VALUE...", help="stiffness_nm_per_rad=80, limits.torque_nm=1"),
+    ],
+) -> int:
+    """Change the wall of a run while it is rendered; the keys are those of [[schedule]]."""
+    from canwall.live import change as post
+    from canwall.record import RunFolder
+
+    cycle = post(RunFolder(folder), assignments)
+    _console.print(f"in force from cycle {cycle} on", highlight=False)
+    return 0
+
+
+@app.command()
 def drive(
     config_file: _ConfigArgument = None,
     real_time: Annotated[

@@ -22,7 +22,6 @@ from canwall import simdrive
 from canwall.compiled import Record, compiled
 from canwall.config import ConfigError, Settings
 from canwall.cycle import (
-    MAX_LAWS,
     Axis,
     Change,
     ExternalSync,
@@ -30,17 +29,19 @@ from canwall.cycle import (
     PythonCanExchange,
     Watch,
     real_time_priority,
+    run_laws,
     run_loop,
     timing_summary,
 )
 from canwall.drive import REQUIRED_OBJECTS, DriveError, DriveNode, DriveSetup, Link, set_up
 from canwall.eds import load_eds
 from canwall.errors import RunFailedError
+from canwall.live import open_to_changes
 from canwall.physics import advance, make_plant
 from canwall.plots import plot_run
 from canwall.record import Recorder, RecordError, Ring, RunFolder, read_signals
 from canwall.summary import summarise
-from canwall.walls import Law, UnknownLawError, find_law
+from canwall.walls import Law
 
 Array = NDArray[np.float64]
 
@@ -253,7 +254,11 @@ def run_together(
                 exchange = make_exchange(link, axes)
                 watch = make_watch(link, axes)
                 report("rendering")
-                with stop_on_signals() as stop, scheduled(first) as scheduling:
+                with (
+                    open_to_changes(axes, folders),
+                    stop_on_signals() as stop,
+                    scheduled(first) as scheduling,
+                ):
                     outcome = render(
                         exchange, stop, lambda now_s: progress(now_s, first.run.duration_s)
                     )
@@ -362,25 +367,6 @@ def _recorded(folder: RunFolder, troubles: list[str]) -> pa.Table:
     if signals.num_rows == 0:
         raise RunFailedError("; ".join(troubles))
     return signals
-
-
-def run_laws(settings: Settings) -> list[Law]:
-    """The laws of the run, each once, in the order in which they are first used.
-
-    Raises ConfigError for a law that is not there or has not the options that it is given.
-    """
-    laws: dict[str, Law] = {}
-    walls = [wall for stage in settings.stages for wall in settings.laws_in_turn(stage.wall)]
-    for wall in walls:
-        try:
-            law = find_law(wall.law, wall.deadbeat)
-            law.option_values(wall.options)
-        except UnknownLawError as error:
-            raise ConfigError(f"wall.law: {error}") from None
-        laws[law.name] = law
-    if len(laws) > MAX_LAWS:
-        raise ConfigError(f"schedule: {len(laws)} laws; a run may change among {MAX_LAWS}")
-    return list(laws.values())
 
 
 @contextmanager

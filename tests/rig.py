@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from canwall import config, simdrive
 from canwall.config import Settings
-from canwall.cycle import Axis, Change, Outcome, PythonCanExchange, run_loop
+from canwall.cycle import Axis, Change, Outcome, PythonCanExchange, run_laws, run_loop
 from canwall.drive import REQUIRED_OBJECTS, DriveNode, DriveSetup, Link, set_up
 from canwall.eds import load_eds
 from canwall.record import Ring
-from canwall.run import make_watch, run_laws
+from canwall.run import make_watch
 
 SIM_CONFIG = config.shipped("config/sim.toml")
 SYNC, TPDO1, RPDO1, SDO_REQUEST, SDO_ANSWER = 0x080, 0x185, 0x205, 0x605, 0x585

@@ -29,12 +29,11 @@ from rig import RPDO1, SDO_ANSWER, SDO_REQUEST, SYNC, TPDO1, settings_with
 
 import canwall.run
 from canwall import config
-from canwall.cycle import make_cycle, set_wall, step
+from canwall.cycle import make_cycle, run_laws, set_wall, step
 from canwall.cycle.step import start_at
 from canwall.drive import DriveSetup, Field, PdoLayout
 from canwall.errors import RunFailedError
 from canwall.record import ROW, Phase, Recorder
-from canwall.run import run_laws
 from canwall.units import DriveUnits
 
 UNIXCAN_CONFIG = config.shipped("config/unixcan.toml")

@@ -6,7 +6,7 @@ is a `ConfigError` of one line: file, key, what is wrong, what to do.
 
 from canwall.config.drive import Drive
 from canwall.config.fault import AMOUNTS, NUMBERS, ON_FRAMES, Direction, Fault, FaultName
-from canwall.config.reading import ConfigError, absolute_law, load, shipped
+from canwall.config.reading import ConfigError, absolute_law, first_error, load, shipped
 from canwall.config.settings import (
     Bus,
     Change,
@@ -14,6 +14,7 @@ from canwall.config.settings import (
     Limits,
     Mechanics,
     Run,
+    Scheduled,
     Settings,
     Stage,
     Wall,
@@ -36,11 +37,13 @@ __all__ = [
     "Limits",
     "Mechanics",
     "Run",
+    "Scheduled",
     "Settings",
     "Simulation",
     "Stage",
     "Wall",
     "absolute_law",
+    "first_error",
     "load",
     "shipped",
 ]

@@ -74,7 +74,7 @@ def load(path: Path, overrides: Mapping[str, Any] | None = None) -> Settings:
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     except ValidationError as error:
-        raise ConfigError(f"{path}: {_first_error(error, raw)}") from None
+        raise ConfigError(f"{path}: {first_error(error)}") from None
     return _with_absolute_paths(settings, path.parent)
 
 
@@ -86,6 +86,8 @@ def _with_absolute_paths(settings: Settings, base: Path) -> Settings:
         "alternate": tuple(absolute_law(law, base) for law in settings.wall.alternate),
     }
     wall = settings.wall.model_copy(update=laws)
+    more = tuple(absolute_law(law, base) for law in settings.run.more_laws)
+    run = settings.run.model_copy(update={"more_laws": more})
     schedule = tuple(
         change.model_copy(update={"law": change.law and absolute_law(change.law, base)})
         for change in settings.schedule
@@ -95,7 +97,13 @@ def _with_absolute_paths(settings: Settings, base: Path) -> Settings:
         store = (base / simulation.store).resolve()
         simulation = simulation.model_copy(update={"store": store})
     return settings.model_copy(
-        update={"drive": drive, "wall": wall, "schedule": schedule, "simulation": simulation}
+        update={
+            "drive": drive,
+            "wall": wall,
+            "run": run,
+            "schedule": schedule,
+            "simulation": simulation,
+        }
     )
 
 
@@ -115,14 +123,14 @@ _IN_TOML = {
 }
 
 
-def _first_error(error: ValidationError, raw: Mapping[str, Any]) -> str:
+def first_error(error: ValidationError, model: type[BaseModel] = Settings) -> str:
     """One line for the first thing that is wrong: key, what, what to do."""
     first = error.errors()[0]
     where = [str(part) for part in first["loc"]]
     key = ".".join(where)
     given = first["input"]
     if first["type"] == "extra_forbidden":
-        return f"{key}: unknown key{_suggestion(where)}"
+        return f"{key}: unknown key{_suggestion(where, model)}"
     if first["type"] == "missing":
         return f"{key}: is missing; add it"
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
@@ -139,8 +147,7 @@ def _shown(value: object) -> str:
     return repr(value) if isinstance(value, str | int | float | bool) else type(value).__name__
 
 
-def _suggestion(where: list[str]) -> str:
-    model: Any = Settings
+def _suggestion(where: list[str], model: Any) -> str:
     for part in where[:-1]:
         if part.isdigit():
             continue

@@ -6,7 +6,7 @@ import tomli_w
 from pydantic import Field, field_validator, model_validator
 
 from canwall.config.drive import Drive
-from canwall.config.section import NonNegative, Number, Positive, Section
+from canwall.config.section import Names, NonNegative, Number, Positive, Section
 from canwall.config.simulation import Simulation
 
 
@@ -46,12 +46,7 @@ class Wall(Section):
     tension: Literal["allow", "clamp", "budget"] = "allow"
     passivity_nm_s_per_rad: NonNegative = 0.0
     divider: int = Field(1, ge=1, le=1000)
-    alternate: tuple[str, ...] = ()
-
-    @field_validator("alternate", mode="before")
-    @classmethod
-    def _laws(cls, value: object) -> object:
-        return tuple(value) if isinstance(value, list) else value
+    alternate: Names = ()
 
 
 class Estimator(Section):
@@ -101,6 +96,7 @@ class Run(Section):
     duration_s: Positive | None = None
     ramp_in_s: NonNegative = 0.5
     blend_s: NonNegative = 0.05
+    more_laws: Names = ()
     bus_log: Literal["bus.log", "bus.asc", "bus.blf", "bus.csv", "bus.trc", "bus.db"] = "bus.log"
 
 
@@ -114,9 +110,8 @@ class LimitsChange(Section):
 
 
 class Change(Section):
-    """`[[schedule]]`: from at_s on, these keys of `[wall]` (and `limits`) have these values."""
+    """Keys of `[wall]`, and `limits`, that have other values from now on."""
 
-    at_s: NonNegative
     law: str | None = None
     position_rad: Number | None = None
     stiffness_nm_per_rad: NonNegative | None = None
@@ -128,6 +123,21 @@ class Change(Section):
     passivity_nm_s_per_rad: NonNegative | None = None
     divider: Annotated[int, Field(ge=1, le=1000)] | None = None
     limits: LimitsChange | None = None
+
+    def applied_to(self, wall: Wall, limits: Limits) -> tuple[Wall, Limits]:
+        """Wall and limits after the change."""
+        update = self.model_dump(exclude={"at_s", "limits"}, exclude_none=True)
+        if self.law is not None:
+            update.setdefault("options", {})  # they were the other law's
+        if self.limits is not None:
+            limits = limits.model_copy(update=self.limits.model_dump(exclude_none=True))
+        return wall.model_copy(update=update), limits
+
+
+class Scheduled(Change):
+    """`[[schedule]]`: a change, and when it comes."""
+
+    at_s: NonNegative
 
 
 class Stage(NamedTuple):
@@ -149,7 +159,7 @@ class Settings(Section):
     limits: Limits
     run: Run = Run()
     simulation: Simulation | None = None
-    schedule: tuple[Change, ...] = ()
+    schedule: tuple[Scheduled, ...] = ()
 
     @field_validator("schedule", mode="before")
     @classmethod
@@ -182,13 +192,7 @@ class Settings(Section):
         """Wall and limits from each instant on, the first from 0."""
         timeline = [Stage(0.0, self.wall, self.limits)]
         for change in self.schedule:
-            update = change.model_dump(exclude={"at_s", "limits"}, exclude_none=True)
-            if change.law is not None:
-                update.setdefault("options", {})  # they were the other law's
-            wall, limits = timeline[-1].wall.model_copy(update=update), timeline[-1].limits
-            if change.limits is not None:
-                limits = limits.model_copy(update=change.limits.model_dump(exclude_none=True))
-            timeline.append(Stage(change.at_s, wall, limits))
+            timeline.append(Stage(change.at_s, *change.applied_to(*timeline[-1][1:])))
         return timeline
 
     def laws_in_turn(self, wall: Wall) -> list[Wall]:

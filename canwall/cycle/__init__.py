@@ -3,6 +3,7 @@
 from canwall.cycle.axis import Axis, Change
 from canwall.cycle.delay import measured_delay
 from canwall.cycle.exchange import PythonCanExchange
+from canwall.cycle.laws import run_laws
 from canwall.cycle.loop import Outcome, run_loop
 from canwall.cycle.realtime import real_time_priority
 from canwall.cycle.step import CYCLE, MAX_LAWS, Trip, make_cycle, set_wall, step
@@ -27,6 +28,7 @@ __all__ = [
     "observe_ns",
     "percentile_ns",
     "real_time_priority",
+    "run_laws",
     "run_loop",
     "set_wall",
     "step",

@@ -10,7 +10,7 @@ from canwall.config import Limits, Settings, Wall
 from canwall.cycle.step import SYNCHRONOUS_DELAY, make_cycle
 from canwall.cycle.timing import HISTOGRAM
 from canwall.drive import DriveNode, DriveSetup
-from canwall.record import ROW, Ring
+from canwall.record import ROW, Mailbox, Ring
 from canwall.walls import Law
 
 
@@ -33,6 +33,8 @@ class Axis:
     laws: Sequence[Law]
     ring: Ring
     changes: list[Change] = field(default_factory=list)
+    #: What other processes want changed while the wall is rendered.
+    mailbox: Mailbox | None = None
     #: Why the wall was given up, where it is something that came beside the cycle.
     reported: str = ""
     late_rpdo: int = 0
@@ -45,6 +47,7 @@ class Axis:
         self.latency = np.zeros(1, HISTOGRAM)
         given = self.settings.estimator.delay_cycles
         self.delay = SYNCHRONOUS_DELAY if given is None else given
+        self.wall, self.limits = self.settings.wall, self.settings.limits
         self.turns = self.settings.laws_in_turn(self.settings.wall)
 
     @property

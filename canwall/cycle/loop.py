@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import can
 
+from canwall import config
 from canwall.cycle.axis import Axis, Change
 from canwall.cycle.delay import DelayTest
 from canwall.cycle.exchange import PythonCanExchange
@@ -246,20 +247,30 @@ class _Loop:
 
 def _change(axis: Axis, changes: list[Change], period: float) -> None:
     """Change wall and limits where it is time to, each change once the one before is complete."""
-    if axis.cycle["fade_left"][0]:
+    cycle, mailbox = axis.cycle, axis.mailbox
+    if cycle["fade_left"][0]:
         return
-    blend = round(axis.settings.run.blend_s / period)
-    if len(axis.turns) > 1 and axis.cycle["strikes"][0] >= axis.next_turn:
-        fade_over(axis.cycle, blend)
-        set_wall(axis.cycle, axis.turns[axis.next_turn % len(axis.turns)], axis.laws)
+    j = int(cycle["j"][0])
+    due = bool(changes) and changes[0].j <= j
+    turns = len(axis.turns) > 1 and cycle["strikes"][0] >= axis.next_turn
+    if not (due or turns or (mailbox is not None and mailbox.waiting())):
+        return
+    fade_over(cycle, round(axis.settings.run.blend_s / period))
+    if turns:
+        axis.wall = axis.turns[axis.next_turn % len(axis.turns)]
         axis.next_turn += 1
-    if changes and changes[0].j <= axis.cycle["j"][0]:
-        fade_over(axis.cycle, blend)
-        while changes and changes[0].j <= axis.cycle["j"][0]:
-            change = changes.pop(0)
-            set_wall(axis.cycle, change.wall, axis.laws)
-            set_limits(axis.cycle, change.limits)
-            axis.turns = axis.settings.laws_in_turn(change.wall)
+    while changes and changes[0].j <= j:
+        change = changes.pop(0)
+        axis.wall, axis.limits = change.wall, change.limits
+        axis.turns = axis.settings.laws_in_turn(change.wall)
+    if mailbox is not None and mailbox.waiting():
+        posted = config.Change.model_validate_json(mailbox.take(j))
+        axis.wall, axis.limits = posted.applied_to(axis.wall, axis.limits)
+        # A law that was asked for ends the turns; all else holds for the walls in turn as well.
+        walls = [axis.wall] if posted.law else axis.turns
+        axis.turns = [posted.applied_to(wall, axis.limits)[0] for wall in walls]
+    set_wall(cycle, axis.wall, axis.laws)
+    set_limits(cycle, axis.limits)
 
 
 def _is_enabled(axis: Axis) -> bool:

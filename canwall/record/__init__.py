@@ -5,6 +5,7 @@ The cycle writes into a ring in shared memory and never waits for a disk; a proc
 """
 
 from canwall.record.folder import RunFolder, read_signals
+from canwall.record.mailbox import Mailbox
 from canwall.record.recorder import Recorder, RecordError
 from canwall.record.ring import FRAME, ROW, TIMING_COLUMNS, Phase, Ring
 
@@ -12,6 +13,7 @@ __all__ = [
     "FRAME",
     "ROW",
     "TIMING_COLUMNS",
+    "Mailbox",
     "Phase",
     "RecordError",
     "Recorder",

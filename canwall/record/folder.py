@@ -105,6 +105,11 @@ class RunFolder:
         return self.path / "run.png"
 
     @property
+    def live(self) -> Path:
+        """While the run goes on: where its changes are posted."""
+        return self.path / "live.json"
+
+    @property
     def trip(self) -> Path:
         """The last cycles before a trip, every column, for a spreadsheet."""
         return self.path / "trip.csv"

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from canwall import metrics
 from canwall.config import Hand, Mechanics, Settings, Simulation, Wall
+from canwall.cycle import run_laws
 from canwall.record import Ring
 from canwall.run import (
     drive_dictionary,
@@ -15,7 +16,6 @@ from canwall.run import (
     on_the_bus,
     referent_positions,
     render,
-    run_laws,
 )
 from canwall.units import DriveUnits
 

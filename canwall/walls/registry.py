@@ -166,7 +166,7 @@ def _guarded(written: FunctionType) -> Callable[[Any], float]:
 
     def guarded(wall: Any) -> float:
         try:
-            return compiled(wall)  # type: ignore[no-any-return]
+            return compiled(wall)
         except Exception:
             return math.nan
 

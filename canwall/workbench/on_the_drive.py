@@ -17,12 +17,12 @@ from scipy.optimize import brentq
 from canwall import config, metrics
 from canwall.compiled import Record, compiled
 from canwall.config import Settings, Wall
-from canwall.cycle import make_cycle, set_wall
+from canwall.cycle import make_cycle, run_laws, set_wall
 from canwall.drive import DriveSetup, PdoLayout
 from canwall.errors import RunFailedError
 from canwall.plots import COLOURS, draw_strikes
 from canwall.record import read_signals
-from canwall.run import run, run_laws
+from canwall.run import run
 from canwall.units import DriveUnits, to_per_mille
 from canwall.walls import find_law, note_force, wall_force
 from canwall.workbench.sheet import REFERENT, Sheet, blank, legend_below, stairs

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from canwall import config, simdrive
 from canwall.config import Settings
-from canwall.cycle import Axis, PythonCanExchange, step
+from canwall.cycle import Axis, PythonCanExchange, run_laws, step
 from canwall.cycle.step import start_at
 from canwall.drive import REQUIRED_OBJECTS, DriveNode, DriveSetup, Link, set_up
 from canwall.eds import load_eds
@@ -31,7 +31,6 @@ from canwall.run import (
     make_simulated_drive,
     on_the_bus,
     render,
-    run_laws,
 )
 
 _REPEATS = 7

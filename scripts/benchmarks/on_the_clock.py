@@ -15,16 +15,10 @@ from can.interfaces.virtual import VirtualBus
 from numpy.typing import NDArray
 
 from canwall import config
-from canwall.cycle import ProducedSync, real_time_priority
+from canwall.cycle import ProducedSync, real_time_priority, run_laws
 from canwall.drive import Link
 from canwall.record import Ring
-from canwall.run import (
-    drive_dictionary,
-    make_axis,
-    make_exchange,
-    on_the_bus,
-    run_laws,
-)
+from canwall.run import drive_dictionary, make_axis, make_exchange, on_the_bus
 
 _PERIOD_S = 0.001
 _SYNCS = 4000

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from rig import settings_with
 
 from canwall.config import Settings
-from canwall.cycle import Trip, make_cycle, set_wall, step
+from canwall.cycle import Trip, make_cycle, run_laws, set_wall, step
 from canwall.cycle.step import start_at
 from canwall.drive import DriveSetup, Field, PdoLayout
 from canwall.record import ROW, Phase
-from canwall.run import run_laws
 from canwall.units import DriveUnits
 from canwall.walls import UnknownLawError
 

@@ -96,6 +96,8 @@ def test_grid_of_the_produced_sync_begins_with_its_first(make_rig: RigFactory) -
 
 
 def test_external_sync_that_never_comes() -> None:
-    with can.Bus(interface="virtual", channel="no sync") as bus:
-        with pytest.raises(SyncLostError, match=r"for 0\.5 s"):
-            ExternalSync(Link(bus), SYNC, 0.05).next()
+    with (
+        can.Bus(interface="virtual", channel="no sync") as bus,
+        pytest.raises(SyncLostError, match=r"for 0\.5 s"),
+    ):
+        ExternalSync(Link(bus), SYNC, 0.05).next()

@@ -1,0 +1,90 @@
+"""Changes of a wall that is being rendered, from another process: one at a time, in shared memory.
+
+A change is a text that the sender has checked. The loop looks for one between two cycles, takes
+it whole, and says at which cycle; nobody waits for the other but the sender for that answer.
+"""
+
+import fcntl
+import mmap
+import os
+import time
+
+import numpy as np
+
+#: Both counters count changes: posted by senders, taken by the loop; at: the cycle of the last.
+_HEADER = np.dtype([("posted", "i8"), ("taken", "i8"), ("at", "i8"), ("length", "i8")], align=True)
+_TEXT = 4096
+_SIZE = _HEADER.itemsize + _TEXT
+_POLL_S = 0.001
+
+
+class Mailbox:
+    """One piece of shared memory with room for one change."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self._memory = mmap.mmap(descriptor, _SIZE)
+        self._header = np.frombuffer(self._memory, _HEADER, 1)
+        self._posted, self._taken = self._header["posted"], self._header["taken"]
+
+    @classmethod
+    def create(cls) -> "Mailbox":
+        """A new, empty mailbox."""
+        descriptor = os.memfd_create("canwall-mailbox")
+        os.ftruncate(descriptor, _SIZE)
+        return cls(descriptor)
+
+    @classmethod
+    def open(cls, address: str) -> "Mailbox":
+        """The mailbox of another process. Raises OSError where it is gone."""
+        return cls(os.open(address, os.O_RDWR))
+
+    @property
+    def address(self) -> str:
+        """How other processes of this machine open it, as long as this one lives."""
+        return f"/proc/{os.getpid()}/fd/{self._descriptor}"
+
+    def close(self) -> None:
+        """Let go of it."""
+        os.close(self._descriptor)
+
+    def waiting(self) -> bool:
+        """Loop: whether there is a change to be taken."""
+        return bool(self._posted[0] != self._taken[0])
+
+    def take(self, cycle: int) -> str:
+        """Loop: the change that is waiting, which is in force from this cycle on."""
+        length = int(self._header["length"][0])
+        text = self._memory[_HEADER.itemsize : _HEADER.itemsize + length].decode()
+        self._header["at"] = cycle
+        self._taken[0] = self._posted[0]
+        return text
+
+    def post(self, text: str, timeout_s: float) -> int:
+        """Sender: post a change, wait until it was taken; the cycle from which on it is in force.
+
+        Raises ValueError for a text that is too long, TimeoutError where nobody takes it.
+        """
+        data = text.encode()
+        if len(data) > _TEXT:
+            raise ValueError(f"a change of {len(data)} bytes; {_TEXT} is the most")
+        deadline = time.monotonic() + timeout_s
+        # One sender at a time; the lock goes with the process that holds it.
+        fcntl.flock(self._descriptor, fcntl.LOCK_EX)
+        try:
+            while self.waiting():
+                _wait(deadline)
+            self._memory[_HEADER.itemsize : _HEADER.itemsize + len(data)] = data
+            self._header["length"] = len(data)
+            self._posted[0] += 1
+            while self.waiting():
+                _wait(deadline)
+            return int(self._header["at"][0])
+        finally:
+            fcntl.flock(self._descriptor, fcntl.LOCK_UN)
+
+
+def _wait(deadline: float) -> None:
+    if time.monotonic() >= deadline:
+        raise TimeoutError
+    time.sleep(_POLL_S)
