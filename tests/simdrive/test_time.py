@@ -48,6 +48,9 @@ class FreeMass:
     def speed_counts_per_s(self) -> float:
         return self.speed * COUNTS_PER_RAD
 
+    def torque_nm(self) -> float | None:
+        return None
+
     def advance(self, torque_nm: float, duration_s: float) -> None:
         acceleration = torque_nm / INERTIA
         self.position += self.speed * duration_s + acceleration * duration_s**2 / 2.0
