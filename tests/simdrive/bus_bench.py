@@ -25,7 +25,7 @@ class Flywheel:
     inertia_kg_m2: float = 1.0e-4
     position_rad: float = 0.0
     speed_rad_s: float = 0.0
-    torque_nm: float = 0.0
+    pulled_nm: float = 0.0
 
     def counts(self) -> int:
         return round(self.position_rad * COUNTS_PER_RAD)
@@ -33,8 +33,11 @@ class Flywheel:
     def speed_counts_per_s(self) -> float:
         return self.speed_rad_s * COUNTS_PER_RAD
 
+    def torque_nm(self) -> float | None:
+        return None
+
     def advance(self, torque_nm: float, duration_s: float) -> None:
-        self.torque_nm = torque_nm
+        self.pulled_nm = torque_nm
         change = torque_nm / self.inertia_kg_m2 * duration_s
         self.position_rad += (self.speed_rad_s + 0.5 * change) * duration_s
         self.speed_rad_s += change

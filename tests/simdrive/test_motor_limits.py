@@ -39,7 +39,7 @@ def pull(bench: BusBench, torque: int, periods: int) -> list[int]:
     given = []
     for _ in range(periods):
         bench.sync()
-        given.append(round(bench.flywheel.torque_nm / RATED_NM * 1000))
+        given.append(round(bench.flywheel.pulled_nm / RATED_NM * 1000))
     return given
 
 
