@@ -19,7 +19,6 @@ from canopen.objectdictionary import ObjectDictionary
 from numpy.typing import NDArray
 
 from canwall import simdrive
-from canwall.compiled import Record, compiled
 from canwall.config import ConfigError, Settings
 from canwall.cycle import (
     Axis,
@@ -37,9 +36,9 @@ from canwall.drive import REQUIRED_OBJECTS, DriveError, DriveNode, DriveSetup, L
 from canwall.eds import load_eds
 from canwall.errors import RunFailedError
 from canwall.live import open_to_changes
-from canwall.physics import advance, make_plant
 from canwall.plots import plot_run
 from canwall.record import Recorder, RecordError, Ring, RunFolder, read_signals
+from canwall.referent import referent_positions
 from canwall.summary import summarise
 from canwall.walls import Law
 
@@ -417,48 +416,3 @@ def _described(setup: DriveSetup) -> dict[str, Any]:
         "tpdo_cob_id": setup.tpdo.cob_id,
         "rpdo_cob_id": setup.rpdo.cob_id,
     }
-
-
-def referent_positions(
-    settings: Settings, stiffness: Array, damping: Array, wall_position: Array
-) -> Array | None:
-    """Positions relative to the wall, at each SYNC of a run, of the continuous referent; (n,).
-
-    The referent is the same hand with the same script on the same handle, against the continuous
-    wall that each cycle asked for: stiffness [N·m/rad], damping [N·m·s/rad] and position [rad],
-    each of shape (n,). None where the hand is a person's.
-    """
-    if settings.simulation is None:
-        return None
-    simulation, period = settings.simulation, settings.bus.cycle_s
-    side = 1.0 if settings.wall.side == "below" else -1.0
-    origin = side * wall_position
-    constant, slope = simdrive.hand_force(simulation.hand, period, len(stiffness))
-    # Measured from the wall, the hand's spring pulls from another place.
-    pull = side * constant - simulation.hand.stiffness_nm_per_rad * origin
-    y = np.empty(len(stiffness))
-    y[0] = side * simulation.hand.rest_rad - origin[0]
-    plant = make_plant(**simdrive.hand_plant(simulation))
-    _follow(plant, stiffness, damping, origin, pull, side * slope, period, y)
-    return y
-
-
-@compiled
-def _follow(
-    plants: NDArray[np.void],
-    stiffness: Array,
-    damping: Array,
-    origin: Array,
-    constant: Array,
-    slope: Array,
-    period: float,
-    y: Array,
-) -> None:
-    """Fill y from its first value on, starting at rest."""
-    plant: Record = plants[0]
-    v = 0.0
-    for j in range(len(y) - 1):
-        plant.wall_stiffness = stiffness[j]
-        plant.wall_damping = damping[j]
-        y_next, v, _ = advance(plant, y[j], v, constant[j], slope[j], period)
-        y[j + 1] = y_next + origin[j] - origin[j + 1]

@@ -21,7 +21,8 @@ def settings_of(node_id: int, overrides: dict[str, Any] | None = None) -> Settin
 
 
 def columns(result: RunResult) -> dict[str, Any]:
-    table = read_signals(result.folder.signals)
+    """The record up to the end of the walls: leaving takes as long as the slowest drive."""
+    table = read_signals(result.folder.signals).slice(0, round(DURATION_S / 0.001))
     names = [name for name in table.column_names if name not in TIMING_COLUMNS]
     return {name: table[name].to_pylist() for name in names}
 

@@ -6,6 +6,7 @@ is a `ConfigError` of one line: file, key, what is wrong, what to do.
 
 from canwall.config.drive import Drive
 from canwall.config.fault import AMOUNTS, NUMBERS, ON_FRAMES, Direction, Fault, FaultName
+from canwall.config.hand import Hand, Move, RandomStrikes
 from canwall.config.reading import ConfigError, absolute_law, first_error, load, shipped
 from canwall.config.settings import (
     Bus,
@@ -19,7 +20,7 @@ from canwall.config.settings import (
     Stage,
     Wall,
 )
-from canwall.config.simulation import Hand, Simulation
+from canwall.config.simulation import Simulation
 
 __all__ = [
     "AMOUNTS",
@@ -36,6 +37,8 @@ __all__ = [
     "Hand",
     "Limits",
     "Mechanics",
+    "Move",
+    "RandomStrikes",
     "Run",
     "Scheduled",
     "Settings",

@@ -1,40 +1,13 @@
 """`[simulation]`: the mechanics of the simulated drive, and the hand on its handle."""
 
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
 from canwall.config.fault import Fault
+from canwall.config.hand import Hand
 from canwall.config.section import NonNegative, Number, Positive, Section
-
-
-class Hand(Section):
-    """`[simulation.hand]`: a mass, spring and damper about a hand that strikes by script."""
-
-    inertia_kg_m2: NonNegative = 6.4e-5
-    damping_nm_s_per_rad: NonNegative = 0.0256
-    stiffness_nm_per_rad: NonNegative = 3.2
-    strikes: int = Field(4, ge=0)
-    first_strike_s: NonNegative = 0.2
-    interval_s: Positive = 1.0
-    rest_rad: Number = 0.1
-    press_rad: Number = -0.1
-    press_torque_nm: Number = 0.0
-    approach_s: Positive = 0.1
-    press_s: NonNegative = 0.5
-    withdraw_s: Positive = 0.1
-
-    @model_validator(mode="after")
-    def _strikes_fit(self) -> Self:
-        lasts = self.approach_s + self.press_s + self.withdraw_s
-        # Strikes may follow one another without a rest: 0.1 + 0.1 + 0.1 fits into 0.3.
-        if self.strikes > 1 and lasts > self.interval_s * (1.0 + 1e-9):
-            raise ValueError(
-                f"a strike lasts {lasts:g} s (approach_s + press_s + withdraw_s) and does not fit "
-                f"into interval_s = {self.interval_s:g}"
-            )
-        return self
 
 
 class Simulation(Section):
@@ -47,6 +20,12 @@ class Simulation(Section):
     within `home_switch_rad`. What is stored over 0x1010 outlives the drive in the file `store`, if
     there is one.
 
+    The motor cogs with a triangle wave of `cogging_nm` over each of `cogs_per_rev`. Its current
+    loop is a first-order lag of `current_bandwidth_hz` (0: it follows at once) and knows torques
+    in steps of `torque_step_nm` (0: any). The velocity (0x606C) is the difference of the encoder
+    over one period, through a low-pass filter of first order (`velocity_filter_hz`; none: as it
+    is).
+
     Time is one `[bus] cycle_s` per SYNC or, with `real_time`, what is measured. The torque of an
     RPDO acts `torque_delay_cycles` periods after the SYNC (synchronous) or the arrival (254, 255).
     The faults are those of one `seed`.
@@ -57,6 +36,11 @@ class Simulation(Section):
     inertia_kg_m2: Positive = 1.0e-4
     viscous_nm_s_per_rad: NonNegative = 5.0e-4
     coulomb_nm: NonNegative = 0.01
+    cogging_nm: NonNegative = 0.0
+    cogs_per_rev: int = Field(24, ge=1, le=10_000)
+    current_bandwidth_hz: Annotated[NonNegative, Field(le=1e6)] = 0.0
+    torque_step_nm: NonNegative = 0.0
+    velocity_filter_hz: Positive | None = None
     peak_torque_nm: Positive | None = None
     overload_s: NonNegative = 3.0
     dc_link_v: Annotated[Positive, Field(le=1000.0)] = 48.0

@@ -7,7 +7,7 @@ from canwall.simdrive.drive import SimulatedDrive
 from canwall.simdrive.faults import FaultyDrive
 from canwall.simdrive.frame import Frame
 from canwall.simdrive.hand import hand_force
-from canwall.simdrive.motion import ServoMotion, hand_plant
+from canwall.simdrive.motion import ServoMotion, hand_body, hand_plant, handle_plant
 from canwall.simdrive.runner import BusRunner, Device
 
 __all__ = [
@@ -19,7 +19,9 @@ __all__ = [
     "Motion",
     "ServoMotion",
     "SimulatedDrive",
+    "hand_body",
     "hand_force",
     "hand_plant",
+    "handle_plant",
     "make_drive",
 ]

@@ -33,11 +33,14 @@ class Actuator:
     def follow(self, part: float) -> None:
         """Let a part of the torque act: 1, or another in a drive whose torque does not follow."""
         self._part = part
-        self.direct = not self.delayed and part == 1.0
+        self.direct = not self.delayed and part == 1.0 and self._motion.torque_nm() is None
         """Whether the torque that acts is the one that is demanded."""
 
     def torque_nm(self, demand_nm: float) -> float:
         """Torque that acts now, in N·m, where ``demand_nm`` is demanded."""
+        delivered = self._motion.torque_nm()
+        if delivered is not None:
+            return delivered
         return self._part * (self._acting_nm if self.delayed else demand_nm)
 
     def cut(self) -> None:

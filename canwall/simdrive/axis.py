@@ -86,7 +86,8 @@ class Axis:
         """Gives the torque; None: the motor is free."""
         self._slowing_in = NO_MODE
         self._obeyed: int | None = None
-        self._halted = self._follows_target = self._slopes = self._homes = False
+        self._halted = self._follows_target = self._homes = False
+        self._profiles = self._slopes = False
         self._reached = False
         self._shown = (False, False, False)
         self.state_machine = StateMachine(dictionary, self._refresh, self._at_rest)
@@ -247,9 +248,10 @@ class Axis:
         self._halted = bool(operating and in_torque_mode and self._controlword.value & _HALT)
         self._slow(self._halt_option.ramp if self._halted else machine.ramp, mode)
         self._follows_target = operating and mode == CYCLIC_SYNCHRONOUS_TORQUE and not self._halted
+        self._profiles = operating and mode == PROFILE_TORQUE
         sloped = self._slopes
         self._slopes = mode == PROFILE_TORQUE and (
-            self._ramp is Ramp.SLOW_DOWN if self._ramp else operating
+            self._ramp is Ramp.SLOW_DOWN if self._ramp else self._profiles
         )
         if self._slopes:
             self._produce = self._follow_slope
@@ -315,7 +317,7 @@ class Axis:
             status |= self._homing.status
         elif self._follows_target:
             status |= _FOLLOWS_TARGET
-        elif self._reached and ((self._slopes and machine.ramp is None) or machine.stays):
+        elif self._reached and (machine.stays or self._profiles):
             status |= _TARGET_REACHED
         if self._torque.limited or self._inputs.at_limit:
             status |= _INTERNAL_LIMIT_ACTIVE

@@ -31,8 +31,12 @@ class Motion(Protocol):
         """Return the velocity in increments per second."""
         ...
 
+    def torque_nm(self) -> float | None:
+        """Return the torque that the current loop delivers now; None if it follows at once."""
+        ...
+
     def advance(self, torque_nm: float, duration_s: float) -> None:
-        """Move on by ``duration_s`` under a motor torque that is constant meanwhile."""
+        """Move on by ``duration_s`` under a motor torque that is demanded meanwhile."""
         ...
 
 

@@ -7,12 +7,19 @@ that path, between two of them on the straight line that joins them, so that ove
 its forces are affine functions of time and the motion stays exact.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
-from canwall.config import Hand
+from canwall.config import Hand, Move, RandomStrikes
 
 Array = NDArray[np.float64]
+
+
+def _least_jerk(s: Array) -> Array:
+    """From rest at 0 to rest at 1 in unit time."""
+    return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
 
 
 def pressing(hand: Hand, period_s: float, periods: int) -> Array:
@@ -28,15 +35,94 @@ def pressing(hand: Hand, period_s: float, periods: int) -> Array:
         leaving = arrived + hand.press_s
         times += [start, arrived, leaving, leaving + hand.withdraw_s]
         stages += [0.0, 1.0, 1.0, 0.0]
-    s = np.interp(np.arange(periods + 1) * period_s, times, stages)
-    # Minimum jerk from rest to rest.
-    return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+    return _least_jerk(np.interp(np.arange(periods + 1) * period_s, times, stages))
+
+
+def random_moves(strikes: RandomStrikes, rest_rad: float) -> list[Move]:
+    """The strikes of a seed as a script: rest, approach, press, rest, release, and again."""
+    draw = np.random.default_rng(strikes.seed).uniform
+    moves = []
+    for _ in range(strikes.strikes):
+        pause, approach, press, withdraw, depth, torque = (
+            float(draw(*bounds))
+            for bounds in (
+                strikes.pause_s,
+                strikes.approach_s,
+                strikes.press_s,
+                strikes.withdraw_s,
+                strikes.press_rad,
+                strikes.press_torque_nm,
+            )
+        )
+        moves += [
+            Move(move="rest", duration_s=pause),
+            # The muscle builds up on the way, as it does in a strike of `Hand`.
+            Move(move="press", duration_s=approach, torque_nm=torque, position_rad=depth),
+            Move(move="rest", duration_s=press),
+            Move(move="release", duration_s=withdraw, position_rad=rest_rad),
+        ]
+    return moves
+
+
+@dataclass(frozen=True)
+class _Knots:
+    """Where the hand is at rest on its way; between two of them it moves with the least jerk."""
+
+    times: Array
+    positions: Array
+    torques: Array
+
+    @classmethod
+    def of(cls, moves: list[Move], rest_rad: float) -> "_Knots":
+        knots = [(0.0, rest_rad, 0.0)]
+
+        def go(duration_s: float, position: float, torque: float) -> None:
+            knots.append((knots[-1][0] + duration_s, position, torque))
+
+        for move in moves:
+            _, position, torque = knots[-1]
+            if move.move == "tap":
+                assert move.position_rad is not None
+                go(0.5 * move.duration_s, move.position_rad, torque)
+                go(0.5 * move.duration_s, position, torque)
+                continue
+            if move.move == "release":
+                position, torque = rest_rad, 0.0
+            if move.position_rad is not None:
+                position = move.position_rad
+            if move.torque_nm is not None:
+                torque = move.torque_nm
+            go(move.duration_s, position, torque)
+        return cls(*np.array(knots).T)
+
+    def at(self, t: Array) -> tuple[Array, Array]:
+        """Hand position [rad] and muscle torque [N·m] at times t; after the last knot as there."""
+        stage = np.interp(t, self.times, np.arange(len(self.times), dtype=np.float64))
+        knot = np.minimum(stage.astype(np.int64), len(self.times) - 2)
+        share = _least_jerk(stage - knot)
+        return (
+            self.positions[knot] + share * np.diff(self.positions)[knot],
+            self.torques[knot] + share * np.diff(self.torques)[knot],
+        )
+
+
+def _path_and_torque(hand: Hand, period_s: float, periods: int) -> tuple[Array, Array]:
+    """Hand position [rad] and muscle torque [N·m] at SYNC 0 … periods; both (periods + 1,)."""
+    moves = list(hand.script)
+    if hand.random is not None:
+        moves = random_moves(hand.random, hand.rest_rad)
+    if moves:
+        return _Knots.of(moves, hand.rest_rad).at(
+            np.arange(periods + 1, dtype=np.float64) * period_s
+        )
+    stage = pressing(hand, period_s, periods)
+    path = hand.rest_rad + (hand.press_rad - hand.rest_rad) * stage
+    return path, hand.press_torque_nm * stage
 
 
 def hand_path(hand: Hand, period_s: float, periods: int) -> Array:
     """Hand position [rad] at SYNC 0 … periods; shape (periods + 1,)."""
-    stage = pressing(hand, period_s, periods)
-    return hand.rest_rad + (hand.press_rad - hand.rest_rad) * stage
+    return _path_and_torque(hand, period_s, periods)[0]
 
 
 def hand_force(hand: Hand, period_s: float, periods: int) -> tuple[Array, Array]:
@@ -45,8 +131,7 @@ def hand_force(hand: Hand, period_s: float, periods: int) -> tuple[Array, Array]
     u₀ [N·m] and u₁ [N·m/s] on the drive's axis. The part that depends on the handle's own
     position and velocity is not in it: it is the plant's (`motion.hand_plant`).
     """
-    path = hand_path(hand, period_s, periods)
-    torque = hand.press_torque_nm * pressing(hand, period_s, periods)
+    path, torque = _path_and_torque(hand, period_s, periods)
     speed = np.diff(path) / period_s
     spring, damper = hand.stiffness_nm_per_rad, hand.damping_nm_s_per_rad
     constant = spring * path[:-1] + damper * speed + torque[:-1]

@@ -9,12 +9,12 @@ from canwall import metrics
 from canwall.config import Hand, Mechanics, Settings, Simulation, Wall
 from canwall.cycle import run_laws
 from canwall.record import Ring
+from canwall.referent import referent_positions
 from canwall.run import (
     drive_dictionary,
     make_axis,
     make_exchange,
     on_the_bus,
-    referent_positions,
     render,
 )
 from canwall.units import DriveUnits

@@ -11,7 +11,7 @@ from two_bodies import Handle, Log, at, integrate, moved
 from canwall.physics import Force, Grasp, Hand
 
 STILL = Force(0.0, 0.0, 0.0, 0.0)
-BOUNDED = settings(derandomize=True, deadline=None, max_examples=60)
+BOUNDED = settings(derandomize=True, deadline=None, max_examples=100)
 
 
 def constant(value: float) -> Force:
@@ -79,7 +79,7 @@ CASES = {
 def test_as_the_event_search_finds_it(case: str) -> None:
     handle, hand, now, motor, script, duration = CASES[case]
     log = Log()
-    expected = integrate(handle, hand, now, motor, script, duration, 0.01, log)
+    expected = integrate(handle, hand, now, motor, script, duration, 0.05, log)
     assert log.partings + log.impacts >= 1
     found = moved(handle, hand, now, motor, script, duration)
     assert found.touching is expected.touching
@@ -106,13 +106,13 @@ def motions(draw: st.DrawFn) -> tuple[Handle, Hand, Grasp, Force, Force]:
     return handle, hand, now, motor, Force(number(-2.0, 2.0), number(-2.0, 2.0), 0.0, 0.0)
 
 
-@settings(derandomize=True, deadline=None, max_examples=25)
+@settings(derandomize=True, deadline=None, max_examples=200)
 @given(motions())
 def test_any_motion_is_that_of_the_event_search(
     case: tuple[Handle, Hand, Grasp, Force, Force],
 ) -> None:
     handle, hand, now, motor, script = case
-    expected = integrate(handle, hand, now, motor, script, 1.0, 0.02)
+    expected = integrate(handle, hand, now, motor, script, 1.0, 0.05)
     found = moved(handle, hand, now, motor, script, 1.0)
     assert found[:4] == pytest.approx(expected[:4], rel=0.0, abs=1e-8)
 

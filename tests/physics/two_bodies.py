@@ -11,11 +11,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
-from scipy.signal import sawtooth
 
 from canwall.physics import Force, Grasp, Hand, advance_grasp, make_plant
 
 Array = NDArray[np.float64]
+
+#: What is zero all the time is no event.
+NOTHING = 1e-14
 
 
 @dataclass(frozen=True)
@@ -28,9 +30,13 @@ class Handle:
     cogging: float = 0.0
     cog_pitch: float = 1.0
 
-    def torque(self, y: float) -> float:
-        """Cogging torque: a triangle wave that pulls towards 0 at 0."""
-        return float(-self.cogging * sawtooth(2.0 * math.pi * (y / self.cog_pitch + 0.25), 0.5))
+    def torque(self, y: float, half: int) -> float:
+        """Cogging torque, a triangle wave that pulls towards 0 at 0, on its half with that number.
+
+        Each half is a straight line, of slope -4·amplitude/pitch and +4·amplitude/pitch in turn.
+        """
+        slope = -4.0 * self.cogging / self.cog_pitch * (-1) ** half
+        return slope * (y - 0.5 * half * self.cog_pitch)
 
     def cog_energy(self, y: float) -> float:
         """Energy in the cogging torque, from its integral over each half of a cog."""
@@ -100,9 +106,10 @@ def integrate(
     log = log if log is not None else Log()
     y, v, hand_y, hand_v, touching = now
     t, loose = 0.0, 0.0
+    half = math.floor(2.0 * y / handle.cog_pitch + 0.5)
 
     def pull(t: float, y: float, v: float, touching: bool) -> float:
-        force = at(motor, t) + handle.torque(y) - handle.viscous * v
+        force = at(motor, t) + handle.torque(y, half) - handle.viscous * v
         if touching:
             force += at(script, t) - hand.spring * y - hand.viscous * v
         return force
@@ -134,7 +141,7 @@ def integrate(
 
         def press(t: float, state: Array, a: Callable[..., float] = acceleration) -> float:
             inertia = hand.mass * (hand_acceleration(t, state[0], state[1]) - a(t, *state[:2]))
-            return hand.side * inertia
+            return hand.side * inertia + NOTHING
 
         if touching and press(t, np.array([y, v])) < -1e-12:
             touching = False
@@ -154,14 +161,21 @@ def integrate(
             )
 
         def gap(t: float, state: Array) -> float:
-            return float(hand.side * (state[0] - state[2]))
+            return float(hand.side * (state[0] - state[2])) + NOTHING
 
         def hold(t: float, state: Array, touching: bool = touching) -> float:
-            return handle.coulomb - abs(pull(t, state[0], 0.0, touching))
+            return handle.coulomb - abs(pull(t, state[0], 0.0, touching)) + NOTHING
 
         def turn(t: float, state: Array, sense: float = sense) -> float:
             return float(sense * state[1])
 
+        def over(t: float, state: Array, half: int = half) -> float:
+            return float(state[0] - 0.5 * (half + 0.5) * handle.cog_pitch)
+
+        def under(t: float, state: Array, half: int = half) -> float:
+            return float(state[0] - 0.5 * (half - 0.5) * handle.cog_pitch)
+
+        corners = [_event(over, 1.0), _event(under, -1.0)] if handle.cogging else []
         found = solve_ivp(
             motion,
             (t, duration),
@@ -170,6 +184,7 @@ def integrate(
             events=[
                 _event(press if touching else gap, -1.0),
                 _event(turn if sense else hold, -1.0),
+                *corners,
             ],
             rtol=1e-12,
             atol=1e-14,
@@ -189,6 +204,11 @@ def integrate(
             log.lost.append(0.5 * reduced * (v - hand_v) ** 2)
             hand_y, v, hand_v, touching = y, mean, mean, True
             log.impacts += 1
+        elif not found.t_events[1].size:
+            # Over a corner; there it is exactly, lest it is found again.
+            rises = bool(found.t_events[2].size)
+            y = 0.5 * (half + (0.5 if rises else -0.5)) * handle.cog_pitch
+            half += 1 if rises else -1
         elif sense:
             v = 0.0
             log.stops += 1

@@ -48,6 +48,9 @@ class RecordingMotion:
     def speed_counts_per_s(self) -> float:
         return self.speed
 
+    def torque_nm(self) -> float | None:
+        return None
+
     def advance(self, torque_nm: float, duration_s: float) -> None:
         self.calls.append(("advance", torque_nm, duration_s))
         self.position += self.step

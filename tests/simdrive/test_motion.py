@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.optimize import brentq
+from scipy.signal import cont2discrete, lfilter
 
 from canwall.config import Hand, Simulation
 from canwall.simdrive.hand import hand_path
-from canwall.simdrive.motion import ServoMotion, hand_plant
+from canwall.simdrive.motion import ServoMotion, hand_plant, handle_plant
 
 Array = NDArray[np.float64]
 
@@ -52,9 +53,13 @@ def least_jerk(hand: Hand, t: float) -> float:
 
 
 def test_what_moves_is_drive_and_hand_together() -> None:
-    simulation = SMOOTH.model_copy(update={"coulomb_nm": 0.01})
+    simulation = SMOOTH.model_copy(update={"coulomb_nm": 0.01, "cogging_nm": 0.003})
+    cogs = {"cogging": 0.003, "cog_pitch": math.pi / 12.0}
     assert hand_plant(simulation) == pytest.approx(
-        {"mass": 1.64e-4, "viscous": 0.0261, "spring": 3.2, "coulomb": 0.01}
+        {"mass": 1.64e-4, "viscous": 0.0261, "spring": 3.2, "coulomb": 0.01, **cogs}
+    )
+    assert handle_plant(simulation) == pytest.approx(
+        {"mass": 1e-4, "viscous": 5e-4, "coulomb": 0.01, **cogs}
     )
 
 
@@ -143,23 +148,105 @@ def test_friction_holds_against_the_motor() -> None:
     assert motion.speed_rad_s == pytest.approx(0.1 / 1.64e-4 * PERIOD, rel=0.1)
 
 
+def resting_at(position: float, counts_per_rev: float) -> ServoMotion:
+    hand = HAND.model_copy(update={"rest_rad": position})
+    return ServoMotion(SMOOTH.model_copy(update={"hand": hand}), PERIOD, counts_per_rev)
+
+
 @pytest.mark.parametrize("step", [-0.51, -0.49, 0.49, 0.51, 12345.49, -12345.51])
 def test_counts_are_the_nearest(step: float) -> None:
-    motion = ServoMotion(SMOOTH, PERIOD, COUNTS_PER_REV)
-    motion.position_rad = step * 2.0 * math.pi / COUNTS_PER_REV
+    motion = resting_at(step * 2.0 * math.pi / COUNTS_PER_REV, COUNTS_PER_REV)
     assert motion.counts() == round(step)
 
 
-@settings(derandomize=True, deadline=None, max_examples=100)
+@settings(derandomize=True, deadline=None, max_examples=50)
 @given(st.floats(-1e4, 1e4), st.floats(100.0, 1e7))
 def test_counts_are_off_by_half_a_count_at_the_most(position: float, counts_per_rev: float) -> None:
-    motion = ServoMotion(SMOOTH, PERIOD, counts_per_rev)
-    motion.position_rad = position
+    motion = resting_at(position, counts_per_rev)
     exact = position / (2.0 * math.pi) * counts_per_rev
     assert abs(motion.counts() - exact) <= 0.5 + 1e-12 * abs(exact)
 
 
-def test_speed_in_counts() -> None:
-    motion = ServoMotion(SMOOTH, PERIOD, COUNTS_PER_REV)
-    motion.speed_rad_s = 4.0 * math.pi
-    assert motion.speed_counts_per_s() == pytest.approx(2.0 * COUNTS_PER_REV)
+@pytest.mark.parametrize("bandwidth", [None, 50.0, 200.0])
+def test_velocity_is_the_difference_of_the_encoder_through_its_filter(
+    bandwidth: float | None,
+) -> None:
+    simulation = SMOOTH.model_copy(update={"velocity_filter_hz": bandwidth})
+    motion = ServoMotion(simulation, PERIOD, COUNTS_PER_REV)
+    assert motion.speed_counts_per_s() == 0.0
+    counts, quotients, seen = [motion.counts()], [], []
+    for j in range(200):
+        # However the period is divided, the drive looks at its encoder once in it.
+        for share in (0.25, 0.75) if j % 3 else (1.0,):
+            motion.advance(torque_at(j), share * PERIOD)
+        counts.append(motion.counts())
+        quotients.append((counts[-1] - counts[-2]) / PERIOD)
+        seen.append(motion.speed_counts_per_s())
+    assert max(map(abs, quotients)) > 10_000.0
+    expected = np.array(quotients)
+    if bandwidth is not None:
+        # Zero-order-hold equivalent of 1/(1 + s/ω), by scipy.
+        omega = 2.0 * math.pi * bandwidth
+        num, den, _ = cont2discrete(([omega], [1.0, omega]), PERIOD)
+        expected = lfilter(num[0][1:], den, expected)
+    np.testing.assert_allclose(seen, expected, rtol=1e-12, atol=1e-6)
+
+
+def test_script_is_a_function_of_time_however_periods_are_divided() -> None:
+    rng = np.random.default_rng(3)
+    whole = ServoMotion(SMOOTH, PERIOD, COUNTS_PER_REV)
+    parts = ServoMotion(SMOOTH, PERIOD, COUNTS_PER_REV)
+    for _ in range(330):
+        torque = float(rng.normal(0.0, 0.1))
+        whole.advance(torque, PERIOD)
+        share = float(rng.uniform(0.0, 1.0))
+        parts.advance(torque, share * PERIOD)
+        parts.advance(torque, (1.0 - share) * PERIOD)
+        assert parts.position_rad == pytest.approx(whole.position_rad, rel=0.0, abs=1e-12)
+        assert parts.speed_rad_s == pytest.approx(whole.speed_rad_s, rel=0.0, abs=1e-9)
+    coarse = ServoMotion(SMOOTH, PERIOD, COUNTS_PER_REV)
+    fine = ServoMotion(SMOOTH, PERIOD, COUNTS_PER_REV)
+    coarse.advance(0.05, 0.2)
+    for _ in range(1000):
+        fine.advance(0.05, 0.0002)
+    assert fine.position_rad == pytest.approx(coarse.position_rad, rel=0.0, abs=1e-11)
+
+
+@pytest.mark.parametrize("bandwidth", [20.0, 1600.0])
+def test_a_torque_step_arrives_as_the_lag_lets_it(bandwidth: float) -> None:
+    hand = Hand(strikes=0, inertia_kg_m2=0.0, damping_nm_s_per_rad=0.0, stiffness_nm_per_rad=0.0)
+    simulation = Simulation(
+        inertia_kg_m2=1e-4,
+        viscous_nm_s_per_rad=0.0,
+        coulomb_nm=0.0,
+        cogging_nm=0.0,
+        torque_step_nm=0.0,
+        current_bandwidth_hz=bandwidth,
+        hand=hand,
+    )
+    motion = ServoMotion(simulation, PERIOD, COUNTS_PER_REV)
+    lag = 1.0 / (2.0 * math.pi * bandwidth)
+    for j in range(1, 40):
+        motion.advance(0.3, 0.37 * PERIOD)
+        t = j * 0.37 * PERIOD
+        left = math.exp(-t / lag)
+        assert motion.torque_nm() == pytest.approx(0.3 * (1.0 - left), rel=1e-12)
+        speed = 0.3 / 1e-4 * (t - lag * (1.0 - left))
+        way = 0.3 / 1e-4 * (0.5 * t**2 - lag * t + lag**2 * (1.0 - left))
+        assert motion.speed_rad_s == pytest.approx(speed, rel=1e-10)
+        assert motion.position_rad - hand.rest_rad == pytest.approx(way, rel=1e-8, abs=1e-15)
+
+
+def test_the_current_loop_knows_torques_in_steps() -> None:
+    simulation = SMOOTH.model_copy(update={"torque_step_nm": 0.01, "current_bandwidth_hz": 0.0})
+    stepped = ServoMotion(simulation, PERIOD, COUNTS_PER_REV)
+    smooth = ServoMotion(
+        SMOOTH.model_copy(update={"torque_step_nm": 0.0, "current_bandwidth_hz": 0.0}),
+        PERIOD,
+        COUNTS_PER_REV,
+    )
+    for torque, step in ((0.0149, 0.01), (0.0151, 0.02), (-0.0049, 0.0), (-0.306, -0.31)):
+        stepped.advance(torque, PERIOD)
+        smooth.advance(step, PERIOD)
+        assert stepped.position_rad == pytest.approx(smooth.position_rad, rel=1e-14)
+    assert stepped.torque_nm() is None

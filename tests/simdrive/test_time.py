@@ -48,6 +48,9 @@ class FreeMass:
     def speed_counts_per_s(self) -> float:
         return self.speed * COUNTS_PER_RAD
 
+    def torque_nm(self) -> float | None:
+        return None
+
     def advance(self, torque_nm: float, duration_s: float) -> None:
         acceleration = torque_nm / INERTIA
         self.position += self.speed * duration_s + acceleration * duration_s**2 / 2.0
@@ -145,10 +148,13 @@ def test_torque_actual_value_is_the_one_that_acts(delay: float, shown: list[int]
 
 
 def test_power_stage_that_goes_off_ends_the_torque_at_once() -> None:
-    bench = MassBench(delay=2.0)
+    bench = MassBench(delay=2.35)
     for _ in range(5):
         bench.command(0x0F, 800)
         bench.cycle()
+    bench.command(0x0F, -400)
+    bench.cycle()
+    bench.cycle()  # the torque of -400 is under way
     speed = bench.motion.speed
     bench.write(0x6040, 0, 0, 2)
     for _ in range(5):

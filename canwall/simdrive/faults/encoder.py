@@ -22,12 +22,14 @@ class FaultyEncoder:
 
     counts: Callable[[], int]
     speed_counts_per_s: Callable[[], float]
+    torque_nm: Callable[[], float | None]
     advance: Advance
 
     def __init__(self, motion: Motion) -> None:
         """Read truly at first."""
         self._motion = motion
         self.advance = motion.advance
+        self.torque_nm = motion.torque_nm
         self._offset = 0
         self.release()
 
