@@ -29,6 +29,7 @@ RigFactory: TypeAlias = Callable[..., "Rig"]
 """Makes a rig that is closed at the end of the test; arguments as Rig."""
 
 _channels = itertools.count()
+_INITIATE_DOWNLOAD = 1
 
 
 def settings_with(overrides: Mapping[str, Any] | None = None) -> Settings:
@@ -50,6 +51,8 @@ class Tampering:
     lies: dict[Object, int] = field(default_factory=dict)
     #: Abort codes that requests for these objects get.
     aborts: dict[Object, int] = field(default_factory=dict)
+    #: Abort codes that writes to these objects get; they may be read.
+    read_only: dict[Object, int] = field(default_factory=dict)
     #: CAN-IDs that the drive does not hear, and those that it does not send.
     deaf: set[int] = field(default_factory=set)
     mute: set[int] = field(default_factory=set)
@@ -67,8 +70,11 @@ class Tampering:
     def process(self, can_id: int, data: bytes) -> list[simdrive.Frame]:
         if can_id in self.deaf:
             return []
-        if can_id == SDO_REQUEST and multiplexer(data) in self.aborts:
-            code = self.aborts[multiplexer(data)]
+        refused = self.aborts
+        if can_id == SDO_REQUEST and data[0] >> 5 == _INITIATE_DOWNLOAD:
+            refused = self.aborts | self.read_only
+        if can_id == SDO_REQUEST and multiplexer(data) in refused:
+            code = refused[multiplexer(data)]
             return [(SDO_ANSWER, b"\x80" + data[1:4] + code.to_bytes(4, "little"))]
         return self._out(self.drive.process(can_id, data))
 

@@ -19,10 +19,11 @@ from canwall.cycle.step import Trip, fade_in, fade_over, set_delay, set_limits, 
 from canwall.drive import (
     Controlword,
     DriveError,
+    Enabling,
     State,
     controlword_down,
-    controlword_up,
     state_of,
+    status_text,
 )
 from canwall.drive import objects as od
 from canwall.record import Phase
@@ -133,19 +134,23 @@ class _Loop:
         """Zero torque and the state machines up."""
         self._enter(Phase.ENABLING)
         self._first_positions()
+        ways = [Enabling() for _ in self._axes]
         for _ in range(_ENABLE_CYCLES):
             if self._stop():
                 return
-            enabled = [_is_enabled(axis) for axis in self._axes]
+            enabled = [_is_enabled(*pair) for pair in zip(self._axes, ways, strict=True)]
             if all(enabled):
                 return
-            for axis in self._axes:
+            for axis, way in zip(self._axes, ways, strict=True):
+                if way.in_vain:
+                    returns = f"the fault comes back after every reset{_emergency(axis)}"
+                    raise _WallGivenUpError(self._say(axis, returns))
                 if _is_silent(axis):
                     silent = f"no TPDO for {_SILENT_CYCLES} cycles while enabling"
                     raise _WallGivenUpError(self._say(axis, silent))
             self._exchange.cycle()
-        for axis in self._axes:
-            if not _is_enabled(axis):
+        for axis, way in zip(self._axes, ways, strict=True):
+            if not _is_enabled(axis, way):
                 stays = f"the drive stays in {_state(axis)}{_emergency(axis)}"
                 raise _WallGivenUpError(self._say(axis, stays))
 
@@ -273,11 +278,11 @@ def _change(axis: Axis, changes: list[Change], period: float) -> None:
     set_limits(cycle, axis.limits)
 
 
-def _is_enabled(axis: Axis) -> bool:
+def _is_enabled(axis: Axis, way: Enabling) -> bool:
     """Whether the drive shows OPERATION ENABLED; sets the controlword that leads there."""
-    state = state_of(int(axis.cycle["statusword"][0]))
-    axis.cycle["controlword"] = controlword_up(state, int(axis.cycle["controlword"][0]))
-    return state is State.OPERATION_ENABLED
+    statusword = int(axis.cycle["statusword"][0])
+    axis.cycle["controlword"] = way.next(statusword)
+    return state_of(statusword) is State.OPERATION_ENABLED
 
 
 def _is_down(axis: Axis) -> bool:
@@ -291,8 +296,7 @@ def _is_silent(axis: Axis) -> bool:
 
 
 def _state(axis: Axis) -> str:
-    statusword = int(axis.cycle["statusword"][0])
-    return f"{state_of(statusword)} (statusword {statusword:#06x})"
+    return status_text(int(axis.cycle["statusword"][0]))
 
 
 def _emergency(axis: Axis) -> str:

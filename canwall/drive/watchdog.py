@@ -71,7 +71,7 @@ def arm(
     Raises DriveError where it takes none, unless that is accepted.
     """
     passed_over: list[str] = []
-    time_ms = min(math.ceil(time_s * 1e3), _MAX_MS)
+    time_ms = min(math.ceil(round(time_s * 1e3, 6)), _MAX_MS)
     ways: tuple[tuple[str, Callable[[], tuple[float, Beat | None, float]]], ...] = (
         ("RPDO event timer", lambda: _rpdo_event_timer(node, rpdo, time_ms)),
         ("consumer heartbeat", lambda: _consumer_heartbeat(node, time_ms, master_id)),

@@ -25,7 +25,7 @@ _GIVES_UP_S = 5.0
 _GAIN = 0.5
 """Part of a velocity error that is made good within one period."""
 
-_RESET_PERIODS = 100.0
+_RESET_PERIODS = 20.0
 """Integral action time of the velocity controller, in periods."""
 
 

@@ -176,7 +176,9 @@ def test_drive_that_never_enables(make_rig: RigFactory) -> None:
     loop = Loop(make_rig(pressing()))
     loop.rig.tampering.deaf.add(RPDO1)
     outcome = loop.run(500)
-    assert outcome.trips == ["the drive stays in SWITCH ON DISABLED (statusword 0x0250)"]
+    assert outcome.trips == [
+        "the drive stays in SWITCH ON DISABLED (statusword 0x0250: voltage enabled, remote)"
+    ]
     assert outcome.disabled
     assert all(torque == 0 for _, torque in loop.rig.rpdos())
 
@@ -211,6 +213,23 @@ def test_drive_in_fault_is_reset(make_rig: RigFactory) -> None:
     assert_ended_in_order(loop, outcome, loop.rows())
 
 
+def test_fault_that_comes_back_after_every_reset(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing()))
+    out, shown = loop.rig.tampering._out, iter(range(10**6))
+
+    def lying(frames: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
+        words = (b"\x18\x02", b"\x50\x02")  # FAULT, SWITCH ON DISABLED
+        return [
+            (i, data[:4] + words[next(shown) % 2] + data[6:] if i == TPDO1 else data)
+            for i, data in out(frames)
+        ]
+
+    loop.rig.tampering._out = lying  # type: ignore[method-assign]
+    outcome = loop.run(300)
+    assert outcome.trips[0].startswith("the fault comes back after every reset")
+    assert all(torque == 0 for _, torque in loop.rig.rpdos())
+
+
 # Trips
 
 
@@ -236,7 +255,7 @@ def test_drive_that_another_master_disables(make_rig: RigFactory) -> None:
     trip = trip_of(loop, lambda j: loop.rig.inject(SDO_REQUEST, disable))
     assert trip == (
         "cycle 500 (0.500 s): the drive left OPERATION ENABLED: SWITCH ON DISABLED "
-        "(statusword 0x0250)"
+        "(statusword 0x0250: voltage enabled, remote)"
     )
     assert loop.rig.rpdos()[-1] == (0x00, 0)
 

@@ -1,0 +1,130 @@
+"""Which watchdog is set, with what time, what the master has to send, and that it bites."""
+
+import math
+
+import pytest
+from rig import Rig, RigFactory, settings_with
+
+from canwall.drive import Beat, DriveError
+
+READ_ONLY = 0x06010002
+REAL_TIME = {"bus.pace": "real_time", "drive.wait_s": 0.0}
+
+
+def rig_without(make_rig: RigFactory, *missing: int, **drive: object) -> Rig:
+    """A drive in real time; its dictionary lacks some objects, or (0x1400) the RPDO's timer."""
+    rig = make_rig(settings_with(REAL_TIME | {f"drive.{k}": v for k, v in drive.items()}))
+    for index in missing:
+        if index == 0x1400:
+            for communication in range(0x1400, 0x1404):
+                del rig.node.dictionary[communication].subindices[5]
+        else:
+            del rig.node.dictionary[index]
+    return rig
+
+
+def test_rpdo_event_timer_goes_first(make_rig: RigFactory) -> None:
+    rig = rig_without(make_rig)
+    watchdog = rig.set_up().watchdog
+    assert (watchdog.kind, watchdog.time_s, watchdog.beat) == ("RPDO event timer", 0.1, None)
+    assert watchdog.period_s == math.inf
+    assert rig.node.read(0x1400, 5) == 100
+    assert rig.node.read(0x1400, 1) == 0x205  # on again
+
+
+def test_then_the_consumer_heartbeat(make_rig: RigFactory) -> None:
+    rig = rig_without(make_rig, 0x1400, watchdog_s=0.06)
+    watchdog = rig.set_up().watchdog
+    assert (watchdog.kind, watchdog.time_s) == ("consumer heartbeat", 0.06)
+    assert watchdog.beat == Beat(0x77F, b"\x05")
+    assert watchdog.period_s == pytest.approx(0.02)
+    assert rig.node.read(0x1016, 1) == 0x7F003C
+    assert watchdog.passed_over == ("RPDO event timer: no 0x1400:05",)
+
+
+def test_an_entry_that_watches_another_node_is_left_alone(make_rig: RigFactory) -> None:
+    rig = rig_without(make_rig, 0x1400)
+    rig.node.write(0x1016, 1, 0x0901F4)
+    rig.set_up()
+    assert rig.node.read(0x1016, 1) == 0x0901F4
+    assert rig.node.read(0x1016, 2) == 0x7F0064
+
+
+def test_an_entry_of_a_predecessor_is_taken_over(make_rig: RigFactory) -> None:
+    rig = rig_without(make_rig, 0x1400)
+    rig.node.write(0x1016, 1, 0x7F01F4)
+    rig.set_up()
+    assert rig.node.read(0x1016, 1) == 0x7F0064
+
+
+def test_then_life_guarding(make_rig: RigFactory) -> None:
+    rig = rig_without(make_rig, 0x1400, 0x1016)
+    rig.node.write(0x1017, 0, 50)  # who sends heartbeats is not guarded
+    watchdog = rig.set_up().watchdog
+    assert (watchdog.kind, watchdog.beat) == ("life guarding", Beat(0x705, remote=True))
+    assert watchdog.time_s == pytest.approx(0.102)
+    assert watchdog.period_s == pytest.approx(0.034)
+    assert [rig.node.read(i) for i in (0x100C, 0x100D, 0x1017)] == [34, 3, 0]
+
+
+def test_what_is_refused_is_passed_over(make_rig: RigFactory) -> None:
+    rig = rig_without(make_rig)
+    rig.tampering.read_only[(0x1400, 5)] = READ_ONLY
+    rig.tampering.lies[(0x1016, 1)] = 0
+    watchdog = rig.set_up().watchdog
+    assert watchdog.kind == "life guarding"
+    timer, heartbeat = watchdog.passed_over
+    assert "writing 0x64 to 0x1400:05 failed" in timer
+    assert "0x1016:01: wrote 0x7f0064, the drive keeps 0x0" in heartbeat
+    assert rig.node.read(0x1400, 1) == 0x205
+
+
+def test_none_is_refused(make_rig: RigFactory) -> None:
+    rig = rig_without(make_rig, 0x1400, 0x1016, 0x100C)
+    with pytest.raises(DriveError, match=r"no watchdog.*--accept-no-watchdog"):
+        rig.set_up()
+
+
+def test_none_may_be_accepted(make_rig: RigFactory) -> None:
+    rig = rig_without(make_rig, 0x1400, 0x1016, 0x100C, accept_no_watchdog=True)
+    watchdog = rig.set_up().watchdog
+    assert watchdog.kind == "none"
+    assert len(watchdog.passed_over) == 3
+
+
+def test_never_shorter_than_some_cycles(make_rig: RigFactory) -> None:
+    settings = settings_with(REAL_TIME | {"bus.cycle_s": 0.05})
+    assert make_rig(settings).set_up().watchdog.time_s == pytest.approx(0.15)
+
+
+def test_simulated_time_has_time(make_rig: RigFactory) -> None:
+    assert make_rig().set_up().watchdog.time_s == 30.0
+
+
+@pytest.mark.parametrize(
+    ("refused", "said"),
+    [((), "disable voltage (0x6007 = 2)"), ((2,), "fault (0x6007 = 1)")],
+)
+def test_reaction(make_rig: RigFactory, refused: tuple[int, ...], said: str) -> None:
+    rig = rig_without(make_rig)
+    process = rig.tampering.drive.process
+
+    def refusing(can_id: int, data: bytes) -> list[tuple[int, bytes]]:
+        if can_id == 0x605 and data[:4] == b"\x2b\x07\x60\x00" and data[4] in refused:
+            return [(0x585, b"\x80\x07\x60\x00\x30\x00\x09\x06")]
+        return process(can_id, data)
+
+    rig.tampering.drive.process = refusing  # type: ignore[method-assign]
+    assert rig.set_up().watchdog.reaction == said
+
+
+def test_without_0x6007_the_error_behaviour_must_change_the_state(make_rig: RigFactory) -> None:
+    rig = rig_without(make_rig, 0x6007)
+    rig.node.write(0x1029, 1, 1)
+    assert "leaves NMT OPERATIONAL" in rig.set_up().watchdog.reaction
+    assert rig.node.read(0x1029, 1) == 0
+
+
+def test_no_other_node_may_have_the_number_of_the_master() -> None:
+    with pytest.raises(Exception, match="no two nodes of a bus may share one"):
+        settings_with({"bus.master_id": 5})
