@@ -21,7 +21,7 @@ WAIT_S = 30.0
 SYNC_S = 0.005
 TORQUE = 80  # per mille; one of the drives is limited to 100 (0x6072)
 MODES = {4: "PROFILED TORQUE", 10: "CYCLIC SYNCHRONOUS TORQUE"}
-OPERATED = {vendor.file: vendor.torque_modes for vendor in VENDORS} | {OWN: (10, 4)}
+OPERATED = {vendor.file: vendor.modes for vendor in VENDORS} | {OWN: (10, 4)}
 
 CONFIG = """
 [bus]
