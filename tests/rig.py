@@ -78,6 +78,9 @@ class Tampering:
             return [(SDO_ANSWER, b"\x80" + data[1:4] + code.to_bytes(4, "little"))]
         return self._out(self.drive.process(can_id, data))
 
+    def request(self, can_id: int) -> list[simdrive.Frame]:
+        return [] if can_id in self.deaf else self._out(self.drive.request(can_id))
+
     def _out(self, frames: list[simdrive.Frame]) -> list[simdrive.Frame]:
         return [(i, self._lied(i, data)) for i, data in frames if i not in self.mute]
 

@@ -22,8 +22,8 @@ def _least_jerk(s: Array) -> Array:
     return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
 
 
-def pressing(hand: Hand, period_s: float, periods: int) -> Array:
-    """How far the hand has gone from resting (0) to pressing (1), at SYNC 0 … periods.
+def pressing(hand: Hand, period_s: float, periods: int, first: int = 0) -> Array:
+    """How far the hand has gone from resting (0) to pressing (1), at SYNC first … first + periods.
 
     Shape (periods + 1,). Each strike takes approach_s, press_s and withdraw_s; after the last one
     the hand rests.
@@ -35,7 +35,11 @@ def pressing(hand: Hand, period_s: float, periods: int) -> Array:
         leaving = arrived + hand.press_s
         times += [start, arrived, leaving, leaving + hand.withdraw_s]
         stages += [0.0, 1.0, 1.0, 0.0]
-    return _least_jerk(np.interp(np.arange(periods + 1) * period_s, times, stages))
+    return _least_jerk(np.interp(_instants(period_s, periods, first), times, stages))
+
+
+def _instants(period_s: float, periods: int, first: int) -> Array:
+    return np.arange(first, first + periods + 1, dtype=np.float64) * period_s
 
 
 def random_moves(strikes: RandomStrikes, rest_rad: float) -> list[Move]:
@@ -106,32 +110,35 @@ class _Knots:
         )
 
 
-def _path_and_torque(hand: Hand, period_s: float, periods: int) -> tuple[Array, Array]:
-    """Hand position [rad] and muscle torque [N·m] at SYNC 0 … periods; both (periods + 1,)."""
+def _path_and_torque(hand: Hand, period_s: float, periods: int, first: int) -> tuple[Array, Array]:
+    """Hand position [rad] and muscle torque [N·m] at SYNC first … first + periods.
+
+    Both (periods + 1,).
+    """
     moves = list(hand.script)
     if hand.random is not None:
         moves = random_moves(hand.random, hand.rest_rad)
     if moves:
-        return _Knots.of(moves, hand.rest_rad).at(
-            np.arange(periods + 1, dtype=np.float64) * period_s
-        )
-    stage = pressing(hand, period_s, periods)
+        return _Knots.of(moves, hand.rest_rad).at(_instants(period_s, periods, first))
+    stage = pressing(hand, period_s, periods, first)
     path = hand.rest_rad + (hand.press_rad - hand.rest_rad) * stage
     return path, hand.press_torque_nm * stage
 
 
-def hand_path(hand: Hand, period_s: float, periods: int) -> Array:
-    """Hand position [rad] at SYNC 0 … periods; shape (periods + 1,)."""
-    return _path_and_torque(hand, period_s, periods)[0]
+def hand_path(hand: Hand, period_s: float, periods: int, first: int = 0) -> Array:
+    """Hand position [rad] at SYNC first … first + periods; shape (periods + 1,)."""
+    return _path_and_torque(hand, period_s, periods, first)[0]
 
 
-def hand_force(hand: Hand, period_s: float, periods: int) -> tuple[Array, Array]:
+def hand_force(hand: Hand, period_s: float, periods: int, first: int = 0) -> tuple[Array, Array]:
     """Force of the hand on the handle, (u₀, u₁) of u₀ + u₁·t in each period; both (periods,).
+
+    They are the periods that begin with SYNC `first` and those after it.
 
     u₀ [N·m] and u₁ [N·m/s] on the drive's axis. The part that depends on the handle's own
     position and velocity is not in it: it is the plant's (`motion.hand_plant`).
     """
-    path, torque = _path_and_torque(hand, period_s, periods)
+    path, torque = _path_and_torque(hand, period_s, periods, first)
     speed = np.diff(path) / period_s
     spring, damper = hand.stiffness_nm_per_rad, hand.damping_nm_s_per_rad
     constant = spring * path[:-1] + damper * speed + torque[:-1]

@@ -68,10 +68,13 @@ class ServoMotion:
         self._grasp = Grasp(rest, 0.0, rest, 0.0, True)
         self._counts_before = self.counts()
         self._speed_counts_per_s = 0.0
-        self._lay_out(self._PIECE)
+        self._lay_out()
 
-    def _lay_out(self, periods: int) -> None:
-        constant, slope = hand_force(self._simulation.hand, self._period_s, periods)
+    def _lay_out(self) -> None:
+        """Lay out the next piece; what is over is forgotten, however long the drive lives."""
+        self._first = self._elapsed
+        hand = self._simulation.hand
+        constant, slope = hand_force(hand, self._period_s, self._PIECE, self._first)
         self._constant, self._slope = constant.tolist(), slope.tolist()
 
     @property
@@ -127,10 +130,10 @@ class ServoMotion:
 
     def _move(self, demand_nm: float, duration_s: float) -> None:
         """Move on within a period of the script."""
-        if self._elapsed >= len(self._constant):
-            self._lay_out(2 * len(self._constant))
-        slope = self._slope[self._elapsed]
-        push = self._constant[self._elapsed]
+        if self._elapsed - self._first >= self._PIECE:
+            self._lay_out()
+        slope = self._slope[self._elapsed - self._first]
+        push = self._constant[self._elapsed - self._first]
         if self._share_s:
             push += slope * self._share_s
         rate = self._lag_rate

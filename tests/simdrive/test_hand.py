@@ -107,8 +107,16 @@ def test_any_script_stays_between_rest_and_press(
     assert stage[0] == 0.0
     assert stage.min() >= -1e-12
     assert stage.max() <= 1.0 + 1e-12
-    # What comes later does not change what was.
-    np.testing.assert_array_equal(pressing(hand, period, 2 * periods)[: periods + 1], stage)
+    # What comes later does not change what was, and it may be laid out in pieces.
+    longer = pressing(hand, period, 2 * periods)
+    np.testing.assert_array_equal(longer[: periods + 1], stage)
+    np.testing.assert_array_equal(pressing(hand, period, periods, periods), longer[periods:])
+    for whole, piece in zip(
+        hand_force(hand, period, 2 * periods),
+        hand_force(hand, period, periods, periods),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(piece, whole[periods:])
 
 
 def test_force_is_that_of_spring_damper_and_muscle() -> None:

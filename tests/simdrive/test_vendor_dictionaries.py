@@ -132,3 +132,30 @@ def test_units(vendor: Vendor, of_vendor: ConfiguredBench, monkeypatch: pytest.M
     assert bench.read(0x6064) == pytest.approx(turn * vendor.counts_per_rev, abs=0.96)
     if vendor.rated_torque_mnm == 1250 and 0x6076 not in vendor.lacks:
         assert bench.read(0x6076) == 1250
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 4])
+def test_four_pdos_each_way_in_the_order_of_cia_301(
+    of_vendor: ConfiguredBench, number: int
+) -> None:
+    bench = of_vendor
+    for communication, cob_id, mapped in (
+        (0x1400 + number - 1, RPDO[number], CONTROLWORD),
+        (0x1800 + number - 1, NO_RTR | TPDO[number], STATUSWORD),
+    ):
+        mapping = communication + 0x200
+        configure(bench, communication, cob_id, [mapped])
+        for index, subindex, value, size in (
+            (mapping, 0, 0, 1),  # while it is valid
+            (mapping, 1, mapped, 4),
+            (communication, 1, cob_id ^ 0x20, 4),
+        ):
+            with pytest.raises(SdoAbortedError, match="08000022"):
+                bench.write(index, subindex, value, size)
+        bench.write(communication, 1, NOT_VALID | cob_id, 4)
+        with pytest.raises(SdoAbortedError, match="08000022"):
+            bench.write(mapping, 1, mapped, 4)  # while the number of entries is not 0
+        bench.write(mapping, 0, 0, 1)
+        with pytest.raises(SdoAbortedError, match="08000022"):
+            bench.write(communication, 1, cob_id, 4)  # valid with nothing in it
+        assert bench.read(communication, 1) == NOT_VALID | cob_id

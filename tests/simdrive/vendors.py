@@ -53,10 +53,10 @@ class ConfiguredBench(Bench):
     Ingenia's begins with a current limit (0x6073) of 4 %, which its user has to raise.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, simulation: Simulation = SIMULATION) -> None:
         self.path = path
         settings = DriveSettings(node_id=NODE_ID, eds=path)
-        self.drive = make_drive(settings, SIMULATION, 0.001)
+        self.drive = make_drive(settings, simulation, 0.001)
         self.sent = self.drive.boot()
         if path.name.startswith("ingenia"):
             self.write(0x6073, 0, 1000, 2)
