@@ -1,7 +1,7 @@
 """`[simulation]`: the mechanics of the simulated drive, and the hand on its handle."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Self
 
 from pydantic import Field, field_validator
 
@@ -23,8 +23,7 @@ class Simulation(Section):
     The motor cogs with a triangle wave of `cogging_nm` over each of `cogs_per_rev`. Its current
     loop is a first-order lag of `current_bandwidth_hz` (0: it follows at once) and knows torques
     in steps of `torque_step_nm` (0: any). The velocity (0x606C) is the difference of the encoder
-    over one period, through a low-pass filter of first order (`velocity_filter_hz`; none: as it
-    is).
+    over one period, through a low-pass filter of first order (`velocity_filter_hz`; 0: as it is).
 
     Time is one `[bus] cycle_s` per SYNC or, with `real_time`, what is measured. The torque of an
     RPDO acts `torque_delay_cycles` periods after the SYNC (synchronous) or the arrival (254, 255).
@@ -36,11 +35,11 @@ class Simulation(Section):
     inertia_kg_m2: Positive = 1.0e-4
     viscous_nm_s_per_rad: NonNegative = 5.0e-4
     coulomb_nm: NonNegative = 0.01
-    cogging_nm: NonNegative = 0.0
+    cogging_nm: NonNegative = 0.003
     cogs_per_rev: int = Field(24, ge=1, le=10_000)
     current_bandwidth_hz: Annotated[NonNegative, Field(le=1e6)] = 0.0
-    torque_step_nm: NonNegative = 0.0
-    velocity_filter_hz: Positive | None = None
+    torque_step_nm: NonNegative = 0.0003
+    velocity_filter_hz: NonNegative = 200.0
     peak_torque_nm: Positive | None = None
     overload_s: NonNegative = 3.0
     dc_link_v: Annotated[Positive, Field(le=1000.0)] = 48.0
@@ -74,3 +73,8 @@ class Simulation(Section):
     @classmethod
     def _path(cls, value: object) -> object:
         return Path(value) if isinstance(value, str) else value
+
+    def with_ideal_servo(self) -> Self:
+        """The same mechanics behind a motor without cogging that gives any torque at once."""
+        ideal = {"cogging_nm": 0.0, "torque_step_nm": 0.0, "current_bandwidth_hz": 0.0}
+        return self.model_copy(update=ideal)

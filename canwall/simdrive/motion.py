@@ -59,9 +59,7 @@ class ServoMotion:
         self._lag_rate = 2.0 * math.pi * bandwidth if bandwidth else 0.0
         self._torque_nm = 0.0
         filtered = simulation.velocity_filter_hz
-        self._smoothing = (
-            -math.expm1(-2.0 * math.pi * filtered * period_s) if filtered is not None else 1.0
-        )
+        self._smoothing = -math.expm1(-2.0 * math.pi * filtered * period_s) if filtered else 1.0
         self._elapsed = 0
         self._share_s = 0.0
         rest = simulation.hand.rest_rad

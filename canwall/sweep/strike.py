@@ -74,8 +74,9 @@ def strike_settings(
     share of the way of one period, and with it the instant of contact against the SYNC.
     The model of the laws has drive and hand but for the hand's spring: about a hand that moves, it
     is for the estimated force. known_inertia is the share of the inertia that the model knows.
+    The servo is an ideal one: what is judged is the law.
     """
-    simulation = base.simulation or Simulation()
+    simulation = (base.simulation or Simulation()).with_ideal_servo()
     start = _START_RAD + phase * speed_rad_s * base.bus.cycle_s
     stiffness = operator.stiffness_nm_per_rad
     # A hand with a spring presses by it; without one, by its muscle torque alone.
