@@ -1,5 +1,6 @@
 """What a SYNC does, and in which order; torque, its limits and the statusword bits on them."""
 
+import math
 import struct
 
 import pytest
@@ -15,6 +16,10 @@ from simdrive_bench import (
     TARGET_TORQUE,
     Bench,
 )
+
+from canwall.config import Simulation
+from canwall.simdrive.actuator import Actuator
+from canwall.simdrive.motion import ServoMotion
 
 RATED_NM = 0.637
 ENABLED = 0x1237
@@ -238,3 +243,16 @@ def test_configured_cycle_has_nothing_else_on_the_bus(cyclic: Bench) -> None:
     assert cyclic.read(0x1801, 1) & NOT_VALID
     cyclic.command(0x0F, 10)
     assert [can_id for can_id, _ in cyclic.sync()] == [0x385]
+
+
+def test_actual_torque_is_what_the_current_loop_delivers() -> None:
+    """0x6074 shows the demand at once, 0x6077 what of it has come by each SYNC."""
+    bandwidth = 40.0
+    simulation = Simulation(current_bandwidth_hz=bandwidth, torque_step_nm=0.0)
+    motion = ServoMotion(simulation, PERIOD_S, 131072.0)
+    actuator = Actuator(motion, PERIOD_S, 0.0)
+    assert not actuator.direct
+    for j in range(1, 20):
+        actuator.advance(0.3, 1.0)
+        arrived = 0.3 * (1.0 - math.exp(-2.0 * math.pi * bandwidth * j * PERIOD_S))
+        assert actuator.torque_nm(0.3) == pytest.approx(arrived, rel=1e-12)
