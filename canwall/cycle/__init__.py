@@ -6,7 +6,16 @@ from canwall.cycle.exchange import PythonCanExchange
 from canwall.cycle.laws import run_laws
 from canwall.cycle.loop import Outcome, run_loop
 from canwall.cycle.realtime import real_time_priority
-from canwall.cycle.step import CYCLE, MAX_LAWS, Trip, make_cycle, set_wall, step
+from canwall.cycle.step import (
+    CYCLE,
+    MAX_LAWS,
+    Trip,
+    fade_in,
+    make_cycle,
+    set_wall,
+    start_at,
+    step,
+)
 from canwall.cycle.sync import ExternalSync, ProducedSync
 from canwall.cycle.timing import HISTOGRAM, observe_ns, percentile_ns, timing_summary
 from canwall.cycle.watch import Watch
@@ -23,6 +32,7 @@ __all__ = [
     "PythonCanExchange",
     "Trip",
     "Watch",
+    "fade_in",
     "make_cycle",
     "measured_delay",
     "observe_ns",
@@ -31,6 +41,7 @@ __all__ = [
     "run_laws",
     "run_loop",
     "set_wall",
+    "start_at",
     "step",
     "timing_summary",
 ]

@@ -1,16 +1,26 @@
 """A CiA 402 servo drive that exists on the CAN bus alone: frames in, frames out."""
 
 from canwall.simdrive.axis import Motion
-from canwall.simdrive.build import make_drive
+from canwall.simdrive.build import make_drive, servo_scales
 from canwall.simdrive.dictionary import Dictionary
 from canwall.simdrive.drive import SimulatedDrive
 from canwall.simdrive.faults import FaultyDrive
 from canwall.simdrive.frame import Frame
 from canwall.simdrive.hand import hand_force
-from canwall.simdrive.motion import ServoMotion, hand_body, hand_plant, handle_plant
+from canwall.simdrive.motion import ServoMotion
 from canwall.simdrive.runner import BusRunner, Device
+from canwall.simdrive.servo import (
+    SERVO,
+    encoder_counts,
+    hand_body,
+    hand_plant,
+    handle_plant,
+    make_servo,
+    move_servo,
+)
 
 __all__ = [
+    "SERVO",
     "BusRunner",
     "Device",
     "Dictionary",
@@ -19,9 +29,13 @@ __all__ = [
     "Motion",
     "ServoMotion",
     "SimulatedDrive",
+    "encoder_counts",
     "hand_body",
     "hand_force",
     "hand_plant",
     "handle_plant",
     "make_drive",
+    "make_servo",
+    "move_servo",
+    "servo_scales",
 ]

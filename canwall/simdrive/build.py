@@ -34,16 +34,10 @@ def make_drive(
     """
     memory = Memory(simulation.store)
     node_id = memory.node_id or drive.node_id
-    dictionary = Dictionary.load(drive.eds, drive.node_id if node_id == UNCONFIGURED else node_id)
-    dictionary.supply(0x1000, 0, _SERVO_DRIVE)
-    dictionary.supply(0x6076, 0, round(1000.0 * simulation.rated_torque_nm))
-    dictionary.supply(0x608F, 1, simulation.counts_per_rev)
-    for unit in ((0x608F, 2), (0x6091, 1), (0x6091, 2)):
-        dictionary.supply(*unit, 1)
-    gear_ratio = quotient(dictionary, 0x6091)
-    # What the encoder has, whatever unit the drive shows. 1/1 says as little as nothing.
-    resolution = quotient(dictionary, 0x608F)
-    counts = (simulation.counts_per_rev if resolution == 1.0 else resolution) * gear_ratio
+    dictionary = _dictionary(
+        drive, simulation, drive.node_id if node_id == UNCONFIGURED else node_id
+    )
+    counts, gear_ratio = _encoder(dictionary, simulation)
     encoder = FaultyEncoder(ServoMotion(simulation, sync_period_s, counts))
     hardware = _hardware(simulation, counts / (2.0 * math.pi), gear_ratio)
     simulated = SimulatedDrive(
@@ -59,6 +53,35 @@ def make_drive(
     )
     faults = [planned(fault, sync_period_s, simulation.real_time) for fault in simulation.fault]
     return FaultyDrive(simulated, encoder, faults, simulation.seed, report)
+
+
+def servo_scales(drive: DriveSettings, simulation: Simulation) -> tuple[float, int]:
+    """Encoder increments per turn of the shaft, and rated torque at the motor [mN·m].
+
+    Those of the drive that `make_drive` makes. Raises DictionaryError.
+    """
+    dictionary = _dictionary(drive, simulation, drive.node_id)
+    counts, _ = _encoder(dictionary, simulation)
+    return counts, int(dictionary.number(0x6076, absent=0).value)
+
+
+def _dictionary(drive: DriveSettings, simulation: Simulation, node_id: int) -> Dictionary:
+    """The drive's dictionary, with what the simulation knows where it is silent."""
+    dictionary = Dictionary.load(drive.eds, node_id)
+    dictionary.supply(0x1000, 0, _SERVO_DRIVE)
+    dictionary.supply(0x6076, 0, round(1000.0 * simulation.rated_torque_nm))
+    dictionary.supply(0x608F, 1, simulation.counts_per_rev)
+    for unit in ((0x608F, 2), (0x6091, 1), (0x6091, 2)):
+        dictionary.supply(*unit, 1)
+    return dictionary
+
+
+def _encoder(dictionary: Dictionary, simulation: Simulation) -> tuple[float, float]:
+    """Increments per turn of the shaft, and turns of the motor per turn of the shaft."""
+    gear_ratio = quotient(dictionary, 0x6091)
+    # What the encoder has, whatever unit the drive shows. 1/1 says as little as nothing.
+    resolution = quotient(dictionary, 0x608F)
+    return (simulation.counts_per_rev if resolution == 1.0 else resolution) * gear_ratio, gear_ratio
 
 
 def _hardware(simulation: Simulation, counts_per_rad: float, gear_ratio: float) -> Hardware:

@@ -14,8 +14,8 @@ from scipy.optimize import brentq
 from scipy.signal import cont2discrete, lfilter
 
 from canwall.config import Hand, Simulation
+from canwall.simdrive import ServoMotion, hand_plant, handle_plant
 from canwall.simdrive.hand import hand_path
-from canwall.simdrive.motion import ServoMotion, hand_plant, handle_plant
 
 Array = NDArray[np.float64]
 
