@@ -49,6 +49,8 @@ class Tampering:
     drive: simdrive.SimulatedDrive
     #: Values that uploads give instead of the drive's own.
     lies: dict[Object, int] = field(default_factory=dict)
+    #: Values of objects that the drive does not have.
+    invented: dict[Object, int] = field(default_factory=dict)
     #: Abort codes that requests for these objects get.
     aborts: dict[Object, int] = field(default_factory=dict)
     #: Abort codes that writes to these objects get; they may be read.
@@ -76,6 +78,9 @@ class Tampering:
         if can_id == SDO_REQUEST and multiplexer(data) in refused:
             code = refused[multiplexer(data)]
             return [(SDO_ANSWER, b"\x80" + data[1:4] + code.to_bytes(4, "little"))]
+        if can_id == SDO_REQUEST and multiplexer(data) in self.invented and data[0] >> 5 == 2:
+            value = self.invented[multiplexer(data)]
+            return [(SDO_ANSWER, b"\x43" + data[1:4] + value.to_bytes(4, "little"))]
         return self._out(self.drive.process(can_id, data))
 
     def request(self, can_id: int) -> list[simdrive.Frame]:

@@ -1,0 +1,135 @@
+"""`canwall doctor`: what it finds, what it tests, and that nothing of it stays."""
+
+from pathlib import Path
+
+import pytest
+from commands import command, config_file
+from rig import SIM_CONFIG, Rig, RigFactory, settings_with
+
+from canwall.bench import Findings, examine
+from canwall.drive import REQUIRED_OBJECTS, DriveError, DriveNode
+
+SETTINGS = {"drive.wait_s": 0.0, "drive.watchdog_s": 0.05}
+
+
+def examined(rig: Rig) -> tuple[Findings, list[str]]:
+    findings, announced = Findings(), list[str]()
+    try:
+        examine(rig.link, rig.settings, REQUIRED_OBJECTS, announced.append, findings)
+    finally:
+        # The doctor's node took the place of the rig's on the link.
+        rig.node = DriveNode(rig.link, 5, rig.node.dictionary)
+    return findings, announced
+
+
+def found(findings: Findings, section: str, what: str) -> str:
+    (line,) = (line for line in findings.lines if (line.section, line.what) == (section, what))
+    return line.found
+
+
+@pytest.fixture
+def rig(make_rig: RigFactory) -> Rig:
+    return make_rig(settings_with(SETTINGS))
+
+
+def test_all_is_well(rig: Rig) -> None:
+    findings, announced = examined(rig)
+    assert findings.well
+    assert "cyclic synchronous torque (10)" in found(findings, "mode", "0x6060")
+    assert found(findings, "units", "0x608F") == "131072 counts per turn of the shaft"
+    assert found(findings, "PDO", "TPDO, with every SYNC").startswith("0x185: 0x6064:00 (32 bits)")
+    assert found(findings, "watchdog", "set").startswith("RPDO event timer, 50 ms")
+    assert "SWITCH ON DISABLED" in found(findings, "watchdog", "tested")
+    assert "after the last sign of life" in found(findings, "watchdog", "tested")
+    # What is done to the drive is said before it is done.
+    assert [text.split()[0] for text in announced] == ["setting", "enabling", "falling", "putting"]
+
+
+def test_torque_is_zero_all_the_time(rig: Rig) -> None:
+    examined(rig)
+    assert rig.rpdos()
+    assert all(torque == 0 for _, torque in rig.rpdos())
+    enabled = [word for word, _ in rig.rpdos()]
+    assert 0x0F in enabled
+    assert enabled[-1] == 0
+
+
+def test_nothing_stays(rig: Rig) -> None:
+    before = rig.node.read(0x1A00, 0), rig.node.read(0x1400, 5), rig.node.read(0x6007)
+    findings, _ = examined(rig)
+    after = rig.node.read(0x1A00, 0), rig.node.read(0x1400, 5), rig.node.read(0x6007)
+    assert after == before
+    assert rig.node.read(0x6041) & 0x6F == 0x40
+    assert found(findings, "put back", "changes") == "all undone; nothing was stored"
+
+
+@pytest.mark.parametrize(
+    ("missing", "kind"), [((0x1400,), "consumer heartbeat"), ((0x1400, 0x1016), "life guarding")]
+)
+def test_every_watchdog_bites(rig: Rig, missing: tuple[int, ...], kind: str) -> None:
+    for index in missing:
+        for subindex in (5,) if index == 0x1400 else range(1, 3):
+            rig.tampering.read_only[(index, subindex)] = 0x06010002
+    findings, _ = examined(rig)
+    assert found(findings, "watchdog", "set").startswith(kind)
+    assert "SWITCH ON DISABLED" in found(findings, "watchdog", "tested")
+    assert findings.well
+
+
+def test_watchdog_that_does_not_bite(rig: Rig) -> None:
+    """A drive that takes the deadline, and forgets about it."""
+    while rig.node.read(0x6041) & 0x6F != 0x40:
+        pass
+    rig.tampering.drive.tick = lambda dt: []  # type: ignore[method-assign]
+    findings, _ = examined(rig)
+    assert not findings.well
+    assert "no reaction within" in found(findings, "watchdog", "tested")
+    assert rig.node.read(0x6041) & 0x6F == 0x40
+
+
+def test_limit_beyond_what_the_drive_gives(make_rig: RigFactory) -> None:
+    rig = make_rig(settings_with(SETTINGS | {"drive.parameters": {"0x6072": 100}}))
+    findings, _ = examined(rig)
+    assert not findings.well
+    assert "more than the drive gives" in found(findings, "units", "limits.torque_nm")
+
+
+def test_a_drive_that_fails_is_put_back_as_well(rig: Rig) -> None:
+    before = rig.node.read(0x6007)
+    rig.tampering.mute.add(0x185)
+    with pytest.raises(DriveError, match="it sends no TPDO"):
+        examined(rig)
+    assert rig.node.read(0x6007) == before
+
+
+def test_command_in_plain_lines() -> None:
+    done = command("doctor", SIM_CONFIG)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[0].startswith("identity: 0x1000, 0x1018: device type 0x20192")
+    assert any(line.startswith("watchdog: tested: ") for line in lines)
+    assert not any("│" in line for line in lines)
+    assert "doctor: falling silent, as a dead master would" in done.stderr
+
+
+def test_command_on_a_drive_without_watchdog(tmp_path: Path) -> None:
+    text = SIM_CONFIG.parent.parent.joinpath("eds", "canwall-drive.eds").read_text()
+    kept, keep = [], True
+    for line in text.splitlines():
+        if line.startswith("["):
+            name = line.strip("[]")
+            keep = name.split("sub")[0] not in ("1016", "100C") and not (
+                name.startswith("140") and name.endswith("sub5")
+            )
+        if keep:
+            kept.append(line)
+    eds = tmp_path / "without.eds"
+    eds.write_text("\n".join(kept))
+    file = config_file(tmp_path / "c.toml")
+    done = command("doctor", file, "--eds", eds)
+    assert done.returncode == 1
+    assert "watchdog: set: TROUBLE: none" in done.stdout
+    done = command("run", file, "--eds", eds, "--output", tmp_path / "run")
+    assert done.returncode == 1
+    assert "--accept-no-watchdog goes on without one" in done.stderr
+    assert command("doctor", file, "--eds", eds, "--accept-no-watchdog").returncode == 0

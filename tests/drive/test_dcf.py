@@ -1,0 +1,60 @@
+"""Values of a DCF, written to the drive only when asked."""
+
+from pathlib import Path
+
+import pytest
+from rig import SIM_CONFIG, Rig, RigFactory, settings_with
+
+from canwall.config import ConfigError
+
+EDS = SIM_CONFIG.parent.parent / "eds" / "canwall-drive.eds"
+
+
+@pytest.fixture
+def dcf(tmp_path: Path) -> Path:
+    """Our drive's EDS with values for 0x6072, the PDOs and the target torque."""
+    lines = []
+    for line in EDS.read_text().splitlines():
+        lines.append(line)
+        for section, value in (("[6072]", 1234), ("[1800sub3]", 77), ("[6071]", 99)):
+            if line == section:
+                lines.append(f"ParameterValue={value}")
+    path = tmp_path / "drive.dcf"
+    path.write_text("\n".join(lines))
+    return path
+
+
+def rig_with(make_rig: RigFactory, dcf: Path, download: bool) -> Rig:
+    rig = make_rig(settings_with({"drive.eds": str(dcf), "drive.download_dcf": download}))
+    rig.node.write(0x6072, 0, 2500)
+    return rig
+
+
+def test_not_unless_asked(make_rig: RigFactory, dcf: Path) -> None:
+    rig = rig_with(make_rig, dcf, download=False)
+    rig.set_up()
+    assert rig.node.read(0x6072) == 2500
+
+
+def test_download_and_back(make_rig: RigFactory, dcf: Path) -> None:
+    rig = rig_with(make_rig, dcf, download=True)
+    setup = rig.set_up()
+    assert rig.node.read(0x6072) == 1234
+    # Torque limits that the file has set count, and its PDOs and targets do not.
+    assert setup.torque_limit_nm == pytest.approx(1.234 * 0.637)
+    assert rig.node.read(0x1800, 3) == 0
+    assert rig.node.read(0x6071) == 0
+    assert rig.node.restore() == []
+    assert rig.node.read(0x6072) == 2500
+
+
+@pytest.mark.parametrize("name", ["6072", "0x6072:", "0x60720010", "max_torque"])
+def test_parameter_that_names_no_object(name: str) -> None:
+    with pytest.raises(ConfigError, match=r"drive.parameters: .* names no object"):
+        settings_with({"drive.parameters": {name: 1}})
+
+
+def test_parameter_that_has_no_room(make_rig: RigFactory) -> None:
+    rig = make_rig(settings_with({"drive.parameters": {"0x6072": 70000}}))
+    with pytest.raises(Exception, match="0x6072:00: 0x11170 has no room in it"):
+        rig.set_up()
