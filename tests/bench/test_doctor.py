@@ -133,3 +133,15 @@ def test_command_on_a_drive_without_watchdog(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert "--accept-no-watchdog goes on without one" in done.stderr
     assert command("doctor", file, "--eds", eds, "--accept-no-watchdog").returncode == 0
+
+
+def test_what_cannot_be_put_back_is_a_trouble(rig: Rig) -> None:
+    findings = Findings()
+
+    def announce(what: str) -> None:
+        if what.startswith("putting"):
+            rig.tampering.read_only[(0x6007, 0)] = 0x06010002
+
+    examine(rig.link, rig.settings, REQUIRED_OBJECTS, announce, findings)
+    assert not findings.well
+    assert "writing 0x1 to 0x6007:00 failed" in found(findings, "put back", "not done")
