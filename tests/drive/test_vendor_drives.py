@@ -91,6 +91,8 @@ def test_torque_moves_the_handle_by_as_much(drive: Drive, make_rig: RigFactory) 
     free = {
         "simulation__viscous_nm_s_per_rad": 0.0,
         "simulation__coulomb_nm": 0.0,
+        "simulation__cogging_nm": 0.0,
+        "simulation__torque_step_nm": 0.0,
         "simulation__hand": {
             "strikes": 0,
             "inertia_kg_m2": 0.0,
