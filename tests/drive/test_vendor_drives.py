@@ -125,9 +125,9 @@ def test_strikes_come_out_as_on_our_own_drive(drive: Drive, make_rig: RigFactory
     ours, others = own.rows(), theirs.rows()
     for column in ("position_rad", "torque_applied"):
         # Ingenia's torque comes in other steps, and a plain wall makes much of little.
-        upto = 330 if drive.name == "ingenia" else 700
+        upto = 290 if drive.name == "ingenia" else 700
         a, b = ours[column][:upto], others[column][:upto]
-        assert b[: len(a)] == pytest.approx(a[: len(b)], abs=0.003 if upto == 330 else 1e-9)
+        assert b[: len(a)] == pytest.approx(a[: len(b)], abs=0.003 if upto == 290 else 1e-9)
 
 
 def test_run(drive: Drive, tmp_path: Path) -> None:
