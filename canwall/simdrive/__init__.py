@@ -1,15 +1,13 @@
 """A CiA 402 servo drive that exists on the CAN bus alone: frames in, frames out."""
 
-from canwall.simdrive.axis import Motion
 from canwall.simdrive.build import make_drive, servo_scales
-from canwall.simdrive.dictionary import Dictionary
+from canwall.simdrive.communication.dictionary import Dictionary
+from canwall.simdrive.communication.frame import Frame
 from canwall.simdrive.drive import SimulatedDrive
 from canwall.simdrive.faults import FaultyDrive
-from canwall.simdrive.frame import Frame
-from canwall.simdrive.hand import hand_force
-from canwall.simdrive.motion import ServoMotion
-from canwall.simdrive.runner import BusRunner, Device
-from canwall.simdrive.servo import (
+from canwall.simdrive.mechanics.hand import hand_force
+from canwall.simdrive.mechanics.motion import ServoMotion
+from canwall.simdrive.mechanics.servo import (
     SERVO,
     encoder_counts,
     hand_body,
@@ -18,6 +16,8 @@ from canwall.simdrive.servo import (
     make_servo,
     move_servo,
 )
+from canwall.simdrive.profile.axis import Motion
+from canwall.simdrive.runner import BusRunner, Device
 
 __all__ = [
     "SERVO",

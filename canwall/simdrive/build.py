@@ -5,13 +5,13 @@ from collections.abc import Callable
 
 from canwall.config import Drive as DriveSettings
 from canwall.config import Simulation
-from canwall.simdrive.dictionary import Dictionary
+from canwall.simdrive.communication.dictionary import Dictionary
+from canwall.simdrive.communication.memory import UNCONFIGURED, Memory
 from canwall.simdrive.drive import DEFAULT_BITRATE, SimulatedDrive
 from canwall.simdrive.faults import FaultyDrive, FaultyEncoder, planned
-from canwall.simdrive.hardware import Hardware
-from canwall.simdrive.memory import UNCONFIGURED, Memory
-from canwall.simdrive.motion import ServoMotion
-from canwall.simdrive.position_unit import quotient
+from canwall.simdrive.mechanics.motion import ServoMotion
+from canwall.simdrive.profile.hardware import Hardware
+from canwall.simdrive.profile.position_unit import quotient
 
 _SERVO_DRIVE = 0x20192
 """Device type: profile 402, servo drive."""

@@ -4,29 +4,29 @@ from collections.abc import Callable
 from functools import partial
 from typing import TypeAlias
 
-from canwall.simdrive import lss, nmt, rpdo, tpdo
-from canwall.simdrive.actuator import Actuator
-from canwall.simdrive.axis import Axis, Motion
-from canwall.simdrive.dictionary import Dictionary, Key
-from canwall.simdrive.emcy import (
+from canwall.simdrive.communication import lss, nmt, rpdo, tpdo
+from canwall.simdrive.communication.dictionary import Dictionary, Key
+from canwall.simdrive.communication.emcy import (
     COMMUNICATION,
     HEARTBEAT_LOST,
     RECOVERED_FROM_BUS_OFF,
     EmergencyProducer,
 )
-from canwall.simdrive.error_behaviour import ERROR_BEHAVIOUR, ErrorBehaviour
-from canwall.simdrive.frame import NS_PER_MS, Clock, Frame
-from canwall.simdrive.guarding import NodeGuarding
-from canwall.simdrive.hardware import Hardware
-from canwall.simdrive.heartbeat import HeartbeatConsumer, HeartbeatProducer
-from canwall.simdrive.lss import LssSlave
-from canwall.simdrive.memory import UNCONFIGURED, Memory
-from canwall.simdrive.nmt import NmtSlave, NmtState
-from canwall.simdrive.rpdo import Rpdo
-from canwall.simdrive.sdo import SdoServer
-from canwall.simdrive.store import ParameterStore
-from canwall.simdrive.sync import SyncConsumer
-from canwall.simdrive.tpdo import Tpdo
+from canwall.simdrive.communication.error_behaviour import ERROR_BEHAVIOUR, ErrorBehaviour
+from canwall.simdrive.communication.frame import NS_PER_MS, Clock, Frame
+from canwall.simdrive.communication.guarding import NodeGuarding
+from canwall.simdrive.communication.heartbeat import HeartbeatConsumer, HeartbeatProducer
+from canwall.simdrive.communication.lss import LssSlave
+from canwall.simdrive.communication.memory import UNCONFIGURED, Memory
+from canwall.simdrive.communication.nmt import NmtSlave, NmtState
+from canwall.simdrive.communication.rpdo import Rpdo
+from canwall.simdrive.communication.sdo import SdoServer
+from canwall.simdrive.communication.store import ParameterStore
+from canwall.simdrive.communication.sync import SyncConsumer
+from canwall.simdrive.communication.tpdo import Tpdo
+from canwall.simdrive.mechanics.actuator import Actuator
+from canwall.simdrive.profile.axis import Axis, Motion
+from canwall.simdrive.profile.hardware import Hardware
 
 Receive: TypeAlias = Callable[[bytes], None]
 """Takes the data of the frames with one CAN-ID."""

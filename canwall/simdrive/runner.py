@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 import can
 
-from canwall.simdrive.frame import ERROR_FRAME, Frame
+from canwall.simdrive.communication.frame import ERROR_FRAME, Frame
 
 _TICK_S = 0.001
 """Least time between ticks, and longest wait for a frame."""

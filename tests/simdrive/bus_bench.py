@@ -10,7 +10,7 @@ from can.interfaces.virtual import VirtualBus
 from simdrive_bench import EDS, NODE_ID, PERIOD_S, SYNC
 
 from canwall.simdrive import BusRunner, Dictionary, SimulatedDrive
-from canwall.simdrive.hardware import Hardware
+from canwall.simdrive.profile.hardware import Hardware
 
 RATED_NM = 0.637
 COUNTS_PER_RAD = 131072 / (2.0 * math.pi)

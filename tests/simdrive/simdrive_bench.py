@@ -7,7 +7,7 @@ from pathlib import Path
 from canopen import SdoAbortedError
 
 from canwall.simdrive import Dictionary, Frame, SimulatedDrive
-from canwall.simdrive.memory import Memory
+from canwall.simdrive.communication.memory import Memory
 
 EDS = Path(__file__).parents[2] / "eds" / "canwall-drive.eds"
 NODE_ID = 5

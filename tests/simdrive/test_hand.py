@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from canwall.config import Hand
-from canwall.simdrive.hand import hand_force, hand_path, pressing
+from canwall.simdrive.mechanics.hand import hand_force, hand_path, pressing
 
 Array = NDArray[np.float64]
 

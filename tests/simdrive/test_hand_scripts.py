@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from canwall import config
 from canwall.config import Hand, Move, RandomStrikes, Simulation
-from canwall.simdrive.hand import hand_force, hand_path, random_moves
-from canwall.simdrive.motion import ServoMotion
+from canwall.simdrive.mechanics.hand import hand_force, hand_path, random_moves
+from canwall.simdrive.mechanics.motion import ServoMotion
 
 PERIOD = 1e-3
 SIM = config.shipped("config/sim.toml")

@@ -15,7 +15,7 @@ from scipy.signal import cont2discrete, lfilter
 
 from canwall.config import Hand, Simulation
 from canwall.simdrive import ServoMotion, hand_plant, handle_plant
-from canwall.simdrive.hand import hand_path
+from canwall.simdrive.mechanics.hand import hand_path
 
 Array = NDArray[np.float64]
 

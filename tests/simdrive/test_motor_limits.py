@@ -8,7 +8,7 @@ from bus_bench import COUNTS_PER_RAD, PERIOD_S, RATED_NM, BusBench
 from canopen import SdoAbortedError
 from simdrive_bench import START
 
-from canwall.simdrive.hardware import Hardware
+from canwall.simdrive.profile.hardware import Hardware
 
 WARNING, LIMITED, VOLTAGE = 1 << 7, 1 << 11, 1 << 4
 MakeBench = Callable[[Hardware], BusBench]

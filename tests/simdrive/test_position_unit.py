@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from rig import eds_without
 
-from canwall.simdrive.dictionary import Dictionary
-from canwall.simdrive.position_unit import PositionUnit
+from canwall.simdrive.communication.dictionary import Dictionary
+from canwall.simdrive.profile.position_unit import PositionUnit
 
 PAIR = """[{index:X}]
 ParameterName=x

@@ -20,7 +20,7 @@ from simdrive_bench import NODE_ID, RESET_NODE, SDO_REQUEST, SDO_RESPONSE, Bench
 from vendors import DICTIONARIES, OWN, ConfiguredBench, path_of
 
 from canwall.eds import load_eds
-from canwall.simdrive.abort import AbortCode
+from canwall.simdrive.communication.abort import AbortCode
 
 WHOLE = (*datatypes.SIGNED_TYPES, *datatypes.UNSIGNED_TYPES)
 NO_LENGTH = (

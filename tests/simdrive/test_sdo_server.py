@@ -18,7 +18,7 @@ from simdrive_bench import (
     eds_with,
 )
 
-from canwall.simdrive.abort import AbortCode
+from canwall.simdrive.communication.abort import AbortCode
 
 SAVE = int.from_bytes(b"save", "little")
 DEVICE_NAME = b"canwall simulated servo drive"

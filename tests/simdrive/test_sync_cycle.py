@@ -18,8 +18,8 @@ from simdrive_bench import (
 )
 
 from canwall.config import Simulation
-from canwall.simdrive.actuator import Actuator
-from canwall.simdrive.motion import ServoMotion
+from canwall.simdrive.mechanics.actuator import Actuator
+from canwall.simdrive.mechanics.motion import ServoMotion
 
 RATED_NM = 0.637
 ENABLED = 0x1237

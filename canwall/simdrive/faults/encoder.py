@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Protocol
 
-from canwall.simdrive.axis import Motion
+from canwall.simdrive.profile.axis import Motion
 
 
 class Advance(Protocol):

@@ -4,13 +4,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from random import Random
 
-from canwall.simdrive.dictionary import Dictionary
+from canwall.simdrive.communication.dictionary import Dictionary
+from canwall.simdrive.communication.frame import BUS_OFF, ERROR_FRAME, Frame
 from canwall.simdrive.drive import SimulatedDrive
 from canwall.simdrive.faults.encoder import FaultyEncoder
 from canwall.simdrive.faults.plan import POWER_ON, PlannedFault
 from canwall.simdrive.faults.request import INDEX, FaultRequest
 from canwall.simdrive.faults.wire import Wire
-from canwall.simdrive.frame import BUS_OFF, ERROR_FRAME, Frame
 
 _SOURCE = (INDEX, 1)
 """What EMCY names as the object that noticed."""

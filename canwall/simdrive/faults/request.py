@@ -4,8 +4,8 @@ import math
 from collections.abc import Callable
 
 from canwall.config import AMOUNTS, NUMBERS, ON_FRAMES, Direction
-from canwall.simdrive.abort import AbortCode, AccessError
-from canwall.simdrive.dictionary import Dictionary
+from canwall.simdrive.communication.abort import AbortCode, AccessError
+from canwall.simdrive.communication.dictionary import Dictionary
 from canwall.simdrive.faults.plan import PlannedFault
 
 INDEX = 0x5F00

@@ -6,8 +6,8 @@ from random import Random
 from typing import Literal
 
 from canwall.config import ON_FRAMES
+from canwall.simdrive.communication.frame import CRC_ERROR, ERROR_FRAME, Frame
 from canwall.simdrive.faults.plan import PlannedFault
-from canwall.simdrive.frame import CRC_ERROR, ERROR_FRAME, Frame
 
 Way = Literal["sent", "received"]
 

@@ -2,16 +2,16 @@
 
 from struct import Struct
 
-from canwall.simdrive.abort import AbortCode, AccessError
-from canwall.simdrive.cob_id import (
+from canwall.simdrive.communication.abort import AbortCode, AccessError
+from canwall.simdrive.communication.cob_id import (
     BIT_30,
     CAN_ID,
     NOT_VALID,
     check_can_id,
     check_unchanged_while_valid,
 )
-from canwall.simdrive.dictionary import Dictionary, Key
-from canwall.simdrive.frame import Send
+from canwall.simdrive.communication.dictionary import Dictionary, Key
+from canwall.simdrive.communication.frame import Send
 
 DC_LINK_UNDERVOLTAGE = 0x3220
 COMMUNICATION = 0x8100

@@ -1,10 +1,10 @@
 """From the torque that is wanted to the one that the motor gives: limits, units, display."""
 
-from canwall.simdrive.dictionary import Dictionary
-from canwall.simdrive.feedback import Feedback
-from canwall.simdrive.hardware import Hardware
-from canwall.simdrive.inputs import NEGATIVE_LIMIT, POSITIVE_LIMIT, DigitalInputs
-from canwall.simdrive.overload import Overload
+from canwall.simdrive.communication.dictionary import Dictionary
+from canwall.simdrive.profile.feedback import Feedback
+from canwall.simdrive.profile.hardware import Hardware
+from canwall.simdrive.profile.inputs import NEGATIVE_LIMIT, POSITIVE_LIMIT, DigitalInputs
+from canwall.simdrive.profile.overload import Overload
 
 _NO_LIMIT = 1 << 31
 _PER_MILLE_MILLI = 1e-6

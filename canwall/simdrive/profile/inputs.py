@@ -1,7 +1,7 @@
 """Digital inputs (0x60FD): limit switches, home switch, interlock."""
 
-from canwall.simdrive.dictionary import Dictionary
-from canwall.simdrive.hardware import Hardware
+from canwall.simdrive.communication.dictionary import Dictionary
+from canwall.simdrive.profile.hardware import Hardware
 
 NEGATIVE_LIMIT, POSITIVE_LIMIT, HOME, INTERLOCK = (1 << bit for bit in range(4))
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 from struct import Struct
 from typing import TypeAlias
 
-from canwall.simdrive.abort import AbortCode, AccessError
-from canwall.simdrive.dictionary import Dictionary, Entry, Key
-from canwall.simdrive.frame import NS_PER_MS, Clock, Send
-from canwall.simdrive.sdo_block import BLOCK_SIZE, BlockDownload, BlockUpload
+from canwall.simdrive.communication.abort import AbortCode, AccessError
+from canwall.simdrive.communication.dictionary import Dictionary, Entry, Key
+from canwall.simdrive.communication.frame import NS_PER_MS, Clock, Send
+from canwall.simdrive.communication.sdo_block import BLOCK_SIZE, BlockDownload, BlockUpload
 
 _REQUEST = 0x600
 _RESPONSE = 0x580

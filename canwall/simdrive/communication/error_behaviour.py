@@ -1,7 +1,7 @@
 """Error behaviour (CiA 301, 7.5.2.32): the NMT state that a lost connection leads to."""
 
-from canwall.simdrive.dictionary import Dictionary, Key
-from canwall.simdrive.nmt import NmtSlave, NmtState
+from canwall.simdrive.communication.dictionary import Dictionary, Key
+from canwall.simdrive.communication.nmt import NmtSlave, NmtState
 
 _REACTIONS = range(3)
 ERROR_BEHAVIOUR: Key = (0x1029, 1)

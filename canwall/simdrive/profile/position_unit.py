@@ -6,7 +6,7 @@ feed constant is 0x6092, or follows from a unit of angle in 0x60A8.
 
 import math
 
-from canwall.simdrive.dictionary import Dictionary, Entry
+from canwall.simdrive.communication.dictionary import Dictionary, Entry
 
 #: Codes of 0x60A8 in bits 16 to 23 (CiA 303-2): units per revolution. All others: increments.
 _ANGLES = {0x10: 2.0 * math.pi, 0x41: 360.0, 0xB4: 1.0}

@@ -2,7 +2,7 @@
 
 from collections import deque
 
-from canwall.simdrive.axis import Motion
+from canwall.simdrive.profile.feedback import Motion
 
 
 class Actuator:

@@ -2,17 +2,21 @@
 
 from collections.abc import Callable
 
-from canwall.simdrive import option_codes
-from canwall.simdrive.dictionary import Dictionary, Key
-from canwall.simdrive.emcy import DC_LINK_UNDERVOLTAGE, EXTERNAL_ERROR, EmergencyProducer
-from canwall.simdrive.feedback import Feedback, Motion
-from canwall.simdrive.hardware import Hardware
-from canwall.simdrive.homing import Homing
-from canwall.simdrive.inputs import DigitalInputs
-from canwall.simdrive.option_codes import OptionCode, Ramp
-from canwall.simdrive.slow_down import STANDSTILL_RAD_S, SlowDown
-from canwall.simdrive.state_machine import Command, State, StateMachine
-from canwall.simdrive.torque import TorquePath
+from canwall.simdrive.communication.dictionary import Dictionary, Key
+from canwall.simdrive.communication.emcy import (
+    DC_LINK_UNDERVOLTAGE,
+    EXTERNAL_ERROR,
+    EmergencyProducer,
+)
+from canwall.simdrive.profile import option_codes
+from canwall.simdrive.profile.feedback import Feedback, Motion
+from canwall.simdrive.profile.hardware import Hardware
+from canwall.simdrive.profile.homing import Homing
+from canwall.simdrive.profile.inputs import DigitalInputs
+from canwall.simdrive.profile.option_codes import OptionCode, Ramp
+from canwall.simdrive.profile.slow_down import STANDSTILL_RAD_S, SlowDown
+from canwall.simdrive.profile.state_machine import Command, State, StateMachine
+from canwall.simdrive.profile.torque import TorquePath
 
 __all__ = ["Axis", "Motion"]
 

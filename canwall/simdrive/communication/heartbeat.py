@@ -4,9 +4,9 @@ from collections.abc import Callable
 from functools import partial
 from typing import TypeAlias
 
-from canwall.simdrive.abort import AbortCode, AccessError
-from canwall.simdrive.dictionary import Dictionary, Entry, Key
-from canwall.simdrive.frame import NS_PER_MS, Clock, Send
+from canwall.simdrive.communication.abort import AbortCode, AccessError
+from canwall.simdrive.communication.dictionary import Dictionary, Entry, Key
+from canwall.simdrive.communication.frame import NS_PER_MS, Clock, Send
 
 Report: TypeAlias = Callable[[Key], None]
 """Told of an entry by its (index, sub-index)."""

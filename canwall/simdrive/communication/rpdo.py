@@ -2,12 +2,12 @@
 
 from collections.abc import Callable
 
-from canwall.simdrive.abort import AccessError
-from canwall.simdrive.dictionary import Dictionary, Key
-from canwall.simdrive.emcy import PDO_TOO_SHORT, RPDO_TIMEOUT, EmergencyProducer
-from canwall.simdrive.frame import NS_PER_MS, Clock
-from canwall.simdrive.pdo import Pdo
-from canwall.simdrive.sync import SyncConsumer
+from canwall.simdrive.communication.abort import AccessError
+from canwall.simdrive.communication.dictionary import Dictionary, Key
+from canwall.simdrive.communication.emcy import PDO_TOO_SHORT, RPDO_TIMEOUT, EmergencyProducer
+from canwall.simdrive.communication.frame import NS_PER_MS, Clock
+from canwall.simdrive.communication.pdo import Pdo
+from canwall.simdrive.communication.sync import SyncConsumer
 
 COMMUNICATION = range(0x1400, 0x1600)
 _MAPPING_OFFSET = 0x200

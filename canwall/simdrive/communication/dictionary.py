@@ -9,7 +9,7 @@ import canopen
 from canopen.objectdictionary import ODVariable, datatypes
 
 from canwall.eds import DictionaryError, load_eds
-from canwall.simdrive.abort import AbortCode, AccessError
+from canwall.simdrive.communication.abort import AbortCode, AccessError
 
 MANDATORY = {
     0x1000: ("device type", datatypes.UNSIGNED32),

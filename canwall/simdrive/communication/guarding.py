@@ -2,9 +2,9 @@
 
 from collections.abc import Callable
 
-from canwall.simdrive.dictionary import Dictionary, Key
-from canwall.simdrive.frame import NS_PER_MS, Clock, Send
-from canwall.simdrive.heartbeat import ERROR_CONTROL, Report
+from canwall.simdrive.communication.dictionary import Dictionary, Key
+from canwall.simdrive.communication.frame import NS_PER_MS, Clock, Send
+from canwall.simdrive.communication.heartbeat import ERROR_CONTROL, Report
 
 _GUARD_TIME = (0x100C, 0)
 _LIFE_TIME_FACTOR: Key = (0x100D, 0)

@@ -3,9 +3,9 @@
 from collections.abc import Iterator
 from functools import partial
 
-from canwall.simdrive.abort import AbortCode, AccessError
-from canwall.simdrive.dictionary import Dictionary, Entry
-from canwall.simdrive.memory import Memory
+from canwall.simdrive.communication.abort import AbortCode, AccessError
+from canwall.simdrive.communication.dictionary import Dictionary, Entry
+from canwall.simdrive.communication.memory import Memory
 
 _STORE = 0x1010
 _RESTORE = 0x1011

@@ -7,9 +7,14 @@ mapping entries, number of mapped objects, COB-ID valid. Anything else gets DEVI
 from collections.abc import Callable
 from struct import Struct
 
-from canwall.simdrive.abort import AbortCode, AccessError
-from canwall.simdrive.cob_id import CAN_ID, NOT_VALID, check_can_id, check_unchanged_while_valid
-from canwall.simdrive.dictionary import Dictionary, Entry
+from canwall.simdrive.communication.abort import AbortCode, AccessError
+from canwall.simdrive.communication.cob_id import (
+    CAN_ID,
+    NOT_VALID,
+    check_can_id,
+    check_unchanged_while_valid,
+)
+from canwall.simdrive.communication.dictionary import Dictionary, Entry
 
 CYCLIC = range(1, 241)
 ACYCLIC = 0

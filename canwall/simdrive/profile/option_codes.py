@@ -13,7 +13,7 @@ Braking along the voltage limit (4, 8) is for drives without a current controlle
 
 from enum import Enum, auto
 
-from canwall.simdrive.dictionary import Dictionary
+from canwall.simdrive.communication.dictionary import Dictionary
 
 QUICK_STOP, SHUTDOWN, DISABLE_OPERATION, HALT, FAULT_REACTION = range(0x605A, 0x605F)
 """Index of each option code."""

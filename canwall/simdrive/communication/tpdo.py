@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 
-from canwall.simdrive.abort import AbortCode, AccessError
-from canwall.simdrive.cob_id import BIT_30
-from canwall.simdrive.dictionary import Dictionary
-from canwall.simdrive.frame import NS_PER_100_US, NS_PER_MS, Clock, Send
-from canwall.simdrive.pdo import CYCLIC, EVENT_DRIVEN, SYNCHRONOUS_REMOTE, Pdo
+from canwall.simdrive.communication.abort import AbortCode, AccessError
+from canwall.simdrive.communication.cob_id import BIT_30
+from canwall.simdrive.communication.dictionary import Dictionary
+from canwall.simdrive.communication.frame import NS_PER_100_US, NS_PER_MS, Clock, Send
+from canwall.simdrive.communication.pdo import CYCLIC, EVENT_DRIVEN, SYNCHRONOUS_REMOTE, Pdo
 
 COMMUNICATION = range(0x1800, 0x1A00)
 _MAPPING_OFFSET = 0x200

@@ -3,9 +3,9 @@
 from collections.abc import Callable
 from enum import Enum
 
-from canwall.simdrive import option_codes
-from canwall.simdrive.dictionary import Dictionary
-from canwall.simdrive.option_codes import OptionCode, Ramp
+from canwall.simdrive.communication.dictionary import Dictionary
+from canwall.simdrive.profile import option_codes
+from canwall.simdrive.profile.option_codes import OptionCode, Ramp
 
 
 class State(Enum):

@@ -3,10 +3,10 @@
 import math
 from typing import Protocol
 
-from canwall.simdrive.abort import AbortCode, AccessError
-from canwall.simdrive.dictionary import Dictionary
-from canwall.simdrive.hardware import Hardware
-from canwall.simdrive.position_unit import PositionUnit
+from canwall.simdrive.communication.abort import AbortCode, AccessError
+from canwall.simdrive.communication.dictionary import Dictionary
+from canwall.simdrive.profile.hardware import Hardware
+from canwall.simdrive.profile.position_unit import PositionUnit
 
 _INT32 = 1 << 31
 

@@ -3,8 +3,8 @@
 from binascii import crc_hqx
 from struct import Struct
 
-from canwall.simdrive.abort import AbortCode, AccessError
-from canwall.simdrive.dictionary import Entry
+from canwall.simdrive.communication.abort import AbortCode, AccessError
+from canwall.simdrive.communication.dictionary import Entry
 
 BLOCK_SIZE = 127
 """Segments of a block, as many as the protocol allows."""

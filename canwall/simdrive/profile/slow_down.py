@@ -10,10 +10,10 @@ dictionary that has no deceleration (0x6084, 0x6085), or zero, leaves the motor 
 
 import math
 
-from canwall.simdrive.dictionary import Dictionary
-from canwall.simdrive.feedback import Feedback
-from canwall.simdrive.hardware import Hardware
-from canwall.simdrive.option_codes import Ramp
+from canwall.simdrive.communication.dictionary import Dictionary
+from canwall.simdrive.profile.feedback import Feedback
+from canwall.simdrive.profile.hardware import Hardware
+from canwall.simdrive.profile.option_codes import Ramp
 
 STANDSTILL_RAD_S = 2.0 * math.pi / 60.0
 """Below one revolution per minute the axis counts as standing."""

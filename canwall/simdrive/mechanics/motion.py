@@ -3,8 +3,8 @@
 import math
 
 from canwall.config import Simulation
-from canwall.simdrive.hand import hand_force
-from canwall.simdrive.servo import encoder_counts, make_servo, move_servo
+from canwall.simdrive.mechanics.hand import hand_force
+from canwall.simdrive.mechanics.servo import encoder_counts, make_servo, move_servo
 
 _REACHED = 1.0 - 1e-9
 """Share of a period after which it is over: its parts may miss the whole by a rounding."""

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any, cast
 
 from canwall.eds import DictionaryError
-from canwall.simdrive.abort import AccessError
-from canwall.simdrive.cob_id import CAN_ID
-from canwall.simdrive.dictionary import Dictionary, Entry, Key
+from canwall.simdrive.communication.abort import AccessError
+from canwall.simdrive.communication.cob_id import CAN_ID
+from canwall.simdrive.communication.dictionary import Dictionary, Entry, Key
 
 UNCONFIGURED = 255
 """The node-ID of a device that has none (CiA 305): it answers LSS alone."""

@@ -4,8 +4,8 @@ The present position becomes the home position, and its value the home offset (0
 IEC 61800-7-201 and KEB's drives have it for method 37; 35 is its older number.
 """
 
-from canwall.simdrive.dictionary import Dictionary
-from canwall.simdrive.feedback import Feedback
+from canwall.simdrive.communication.dictionary import Dictionary
+from canwall.simdrive.profile.feedback import Feedback
 
 _ON_CURRENT_POSITION = (35, 37)
 START = 1 << 4  # controlword

@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 
-from canwall.simdrive.abort import AbortCode, AccessError
-from canwall.simdrive.cob_id import BIT_30, CAN_ID, NOT_VALID, check_can_id
-from canwall.simdrive.dictionary import Dictionary, Key
-from canwall.simdrive.emcy import SYNC_LENGTH, SYNC_LOST, EmergencyProducer
-from canwall.simdrive.frame import NS_PER_US, Clock
+from canwall.simdrive.communication.abort import AbortCode, AccessError
+from canwall.simdrive.communication.cob_id import BIT_30, CAN_ID, NOT_VALID, check_can_id
+from canwall.simdrive.communication.dictionary import Dictionary, Key
+from canwall.simdrive.communication.emcy import SYNC_LENGTH, SYNC_LOST, EmergencyProducer
+from canwall.simdrive.communication.frame import NS_PER_US, Clock
 
 _DEFAULT_CAN_ID = 0x080
 _COUNTER_OVERFLOW: Key = (0x1019, 0)

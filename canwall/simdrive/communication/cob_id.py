@@ -1,6 +1,6 @@
 """COB-ID entries (CiA 301, 7.5.2.5, 7.5.2.17, 7.5.2.35): which identifiers may stand in one."""
 
-from canwall.simdrive.abort import AbortCode, AccessError
+from canwall.simdrive.communication.abort import AbortCode, AccessError
 
 CAN_ID = 0x7FF
 NOT_VALID = 1 << 31

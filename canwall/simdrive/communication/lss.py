@@ -4,9 +4,9 @@ from collections.abc import Callable
 from operator import eq, ge, le
 from struct import Struct
 
-from canwall.simdrive.dictionary import Dictionary
-from canwall.simdrive.frame import Send
-from canwall.simdrive.memory import UNCONFIGURED
+from canwall.simdrive.communication.dictionary import Dictionary
+from canwall.simdrive.communication.frame import Send
+from canwall.simdrive.communication.memory import UNCONFIGURED
 
 CAN_ID = 0x7E5
 _RESPONSE_ID = 0x7E4

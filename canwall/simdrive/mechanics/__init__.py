@@ -1,0 +1,1 @@
+"""What turns: motor, current loop, encoder, handle and hand, and the way of the torque to them."""
