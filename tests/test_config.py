@@ -141,6 +141,19 @@ REFUSED: list[tuple[dict[str, object], str]] = [
     # what does not go together
     ({"schedule": [{"at_s": 2}, {"at_s": 1}]}, "schedule: the entries have to be in the order"),
     (
+        {"schedule": [{"at_s": 2, "limits": {"hold_cycles": 3}}]},
+        "schedule.0.limits.hold_cycles: unknown key; known here: torque_nm, torque_rate_nm_per_s",
+    ),
+    (
+        {"schedule": [{"at_s": 2, "law": "damped"}], "wall.alternate": ["midpoint"]},
+        "schedule: changes the law, and so does wall.alternate; keep one",
+    ),
+    ({"wall.alternate": "midpoint"}, "wall.alternate: has to be an array, not 'midpoint'"),
+    ({"wall.divider": 0}, "wall.divider: has to be greater than or equal to 1, not 0"),
+    ({"estimator.delay_cycles": 4}, "estimator.delay_cycles: has to be less than or equal to 3"),
+    ({"bus.sync": "none"}, "bus.sync: has to be 'produce' or 'external', not 'none'"),
+    ({"limits.energy_j": 0}, "limits.energy_j: has to be greater than 0, not 0"),
+    (
         {"wall.position_rad": 4},
         "wall.position_rad = 4 lies outside limits.position_rad = [-3, 3]",
     ),
@@ -373,6 +386,42 @@ def test_the_schedule_changes_only_what_it_names(loaded: Load) -> None:
     assert [w.damping_nm_s_per_rad for w in walls] == [0.0, 0.0, 0.0, 0.5, 0.5]
     assert [w.tension for w in walls] == ["allow", "allow", "clamp", "clamp", "clamp"]
     assert [w.position_rad for w in walls] == [0.0, 0.0, 0.0, 0.25, 0.25]
+
+
+def test_the_schedule_changes_limits_as_well(loaded: Load) -> None:
+    found = loaded(
+        {
+            "limits.torque_nm": 1.0,
+            "limits.speed_rad_s": 20.0,
+            "schedule": [
+                {"at_s": 1, "limits": {"torque_nm": 0.5}},
+                {"at_s": 2, "limits": {"speed_rad_s": 5.0, "energy_j": 0.1}},
+            ],
+        }
+    )
+    limits = [stage.limits for stage in found.stages]
+    assert [at.torque_nm for at in limits] == [1.0, 0.5, 0.5]
+    assert [at.speed_rad_s for at in limits] == [20.0, 20.0, 5.0]
+    assert [at.energy_j for at in limits] == [None, None, 0.1]
+
+
+def test_laws_take_turns_with_their_own_options(loaded: Load) -> None:
+    found = loaded(
+        {
+            "wall.law": "hysteresis",
+            "wall.options": {"softening": 0.5},
+            "wall.alternate": ["standard", "laws.py:mine"],
+        }
+    )
+    turns = found.laws_in_turn(found.wall)
+    assert [wall.law.rpartition("/")[2] for wall in turns] == [
+        "hysteresis",
+        "standard",
+        "laws.py:mine",
+    ]
+    assert turns[2].law.startswith("/")
+    assert [wall.options for wall in turns] == [{"softening": 0.5}, {}, {}]
+    assert {wall.stiffness_nm_per_rad for wall in turns} == {found.wall.stiffness_nm_per_rad}
 
 
 @pytest.mark.parametrize(
