@@ -44,6 +44,9 @@ from canwall.walls import Law
 
 Array = NDArray[np.float64]
 
+#: What asks a run to end.
+_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
 
 class StopRequest:
     """Whether somebody asked the run to end."""
@@ -58,13 +61,17 @@ class StopRequest:
 
 @contextmanager
 def stop_on_signals() -> Iterator[StopRequest]:
-    """Ctrl-C and SIGTERM ask for an end instead of ending: the drive is to be disabled first."""
+    """Ctrl-C, SIGTERM and a terminal that is closed ask for an end instead of ending.
+
+    The drive is to be disabled first. What the program was started to ignore (nohup) it ignores.
+    """
     stop = StopRequest()
 
     def request(number: int, frame: object) -> None:
         stop.requested = True
 
-    previous = {s: signal.signal(s, request) for s in (signal.SIGINT, signal.SIGTERM)}
+    ends = [s for s in _ENDING if signal.getsignal(s) is not signal.SIG_IGN]
+    previous = {s: signal.signal(s, request) for s in ends}
     try:
         yield stop
     finally:

@@ -173,11 +173,12 @@ class Loop:
 
 
 def eds_without(path: Path, *sections: str) -> Path:
-    """The drive's EDS without some objects: names of sections, e.g. "6064"."""
+    """The drive's EDS without some objects: names of sections, e.g. "6064" or "1400sub5"."""
     kept, keep = [], True
     for line in (SIM_CONFIG.parent.parent / "eds" / "canwall-drive.eds").read_text().splitlines():
         if line.startswith("["):
-            keep = line.strip("[]").split("sub")[0] not in sections
+            name = line.strip("[]")
+            keep = name not in sections and name.split("sub")[0] not in sections
         if keep:
             kept.append(line)
     path.write_text("\n".join(kept))

@@ -66,13 +66,27 @@ class Estimator(Section):
 
 
 class Limits(Section):
-    """`[limits]`: torque and its rate are held to theirs; beyond the others the run ends."""
+    """`[limits]`: torque and its rate are held to theirs; beyond the others the run ends.
+
+    jump_rad: how far from where it is expected a position may come; without it, as far as
+    speed_rad_s goes in a cycle. stuck_rad: how far the handle is expected to move within
+    stuck_cycles in which the position stays the same to the count; 0: not watched.
+    torque_error_nm: how far 0x6077 may be for torque_error_cycles from all that was commanded of
+    late; without it a tenth of torque_nm, and no less than 5 % of the rated torque; 0: not watched.
+    late_cycles: RPDOs in a row that come after the next SYNC, in real time; 0: only counted.
+    """
 
     torque_nm: Positive
     torque_rate_nm_per_s: Positive | None = None
     speed_rad_s: Positive = 60.0
     position_rad: tuple[Number, Number] = (-3.0, 3.0)
     energy_j: Positive | None = None
+    jump_rad: Positive | None = None
+    stuck_rad: NonNegative = 0.0005
+    stuck_cycles: int = Field(5, ge=3, le=100)
+    torque_error_nm: NonNegative | None = None
+    torque_error_cycles: int = Field(20, ge=5, le=1000)
+    late_cycles: int = Field(50, ge=0, le=10_000)
     emergency: Literal["trip", "note"] = "trip"
     hold_cycles: int = Field(2, ge=0, le=100)
     ramp_cycles: int = Field(10, ge=1, le=1000)

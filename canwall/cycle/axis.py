@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.config import Limits, Settings, Wall
-from canwall.cycle.step import SYNCHRONOUS_DELAY, make_cycle
+from canwall.cycle.step import SYNCHRONOUS_DELAY, Trip, make_cycle
 from canwall.cycle.timing import HISTOGRAM
 from canwall.drive import DriveNode, DriveSetup
-from canwall.record import ROW, Mailbox, Ring
+from canwall.record import ROW, Mailbox, Phase, Ring
 from canwall.walls import Law
 
 
@@ -38,6 +38,9 @@ class Axis:
     #: Why the wall was given up, where it is something that came beside the cycle.
     reported: str = ""
     late_rpdo: int = 0
+    late_in_a_row: int = 0
+    #: The length of the last TPDO that did not carry what was mapped [bytes]; None: there was none.
+    wrong_length: int | None = None
     #: The next of the walls that take turns, counted from the first on.
     next_turn: int = 1
 
@@ -54,6 +57,20 @@ class Axis:
     def name(self) -> str:
         """How messages call it."""
         return f"node {self.node.node_id}"
+
+    @property
+    def active(self) -> bool:
+        """Whether there may be a torque: the wall is rendered, or the delay measured."""
+        return int(self.cycle["phase"][0]) in (Phase.RENDERING, Phase.MEASURING)
+
+    def give_up(self, text: str) -> None:
+        """End the wall for something that came beside the cycle; the first such thing counts.
+
+        Nothing is given up before there may be a torque, nor while the wall is being left.
+        """
+        if self.active and not self.cycle["trip"][0]:
+            self.reported = text
+            self.cycle["trip"] = np.int64(Trip.REPORTED)
 
     @property
     def measures_delay(self) -> bool:

@@ -66,8 +66,6 @@ class PythonCanExchange:
     def cycle(self) -> None:
         """One cycle. Raises can.CanError where the bus fails."""
         missing = any(axis.cycle["missed_in_a_row"][0] for axis in self.axes)
-        if missing:
-            self._drop_late()
         if not self._real_time:
             self._wait_for_writer()
         interval_s = self._begin()
@@ -82,6 +80,8 @@ class PythonCanExchange:
             axis = awaited.pop(message.arbitration_id)
             # A TPDO that is too short does not carry what was mapped: as good as none.
             complete = len(message.data) >= axis.setup.tpdo.length
+            if not complete:
+                axis.wrong_length = len(message.data)
             data = data_to_number(message.data) if complete else 0
             self._answer(axis, data, complete, received_ns, interval_s)
             if awaited:
@@ -90,12 +90,6 @@ class PythonCanExchange:
             self._answer(axis, 0, False, time.perf_counter_ns(), interval_s)
         if self._beats:
             self._beats.send()
-
-    def _drop_late(self) -> None:
-        # The TPDO that was missed may have come since. Taken for the next one, it would leave
-        # every position after it a cycle old.
-        while self._link.serve(0.0):
-            pass
 
     def _wait_for_writer(self) -> None:
         rings = [axis.ring for axis in self.axes]
@@ -129,9 +123,19 @@ class PythonCanExchange:
         row = axis.row[0]
         row["sync_interval_s"] = interval_s
         row["latency_s"] = latency * 1e-9
-        if self._real_time and sent_ns > self._sync.deadline_ns:
-            axis.late_rpdo += 1
+        if self._real_time:
+            self._note_late(axis, sent_ns > self._sync.deadline_ns)
         put_row(axis.ring.header, axis.ring.rows, axis.row)
+
+    def _note_late(self, axis: Axis, late: bool) -> None:
+        axis.late_rpdo += late
+        axis.late_in_a_row = axis.late_in_a_row + 1 if late else 0
+        most = axis.limits.late_cycles
+        if most and axis.late_in_a_row >= most:
+            axis.give_up(
+                f"RPDOs after the next SYNC for {axis.late_in_a_row} cycles, limits.late_cycles = "
+                f"{most}: the machine is too slow for bus.cycle_s"
+            )
 
 
 def _warm_up(axis: Axis) -> None:

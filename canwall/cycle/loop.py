@@ -22,17 +22,21 @@ from canwall.drive import (
     Enabling,
     State,
     controlword_down,
+    disable,
     state_of,
     status_text,
 )
 from canwall.drive import objects as od
 from canwall.record import Phase
 
-#: Cycles within which a drive has to reach OPERATION ENABLED, and to leave it.
+#: Cycles within which a drive has to reach OPERATION ENABLED.
 _ENABLE_CYCLES = 2000
-_LEAVE_CYCLES = 500
+#: How long a drive may take to leave it by RPDO, before SDO takes its voltage [s, cycles].
+_LEAVE_S, _LEAVE_CYCLES = 0.1, 20
 #: Cycles without a TPDO after which a drive is taken for gone while enabling and leaving.
 _SILENT_CYCLES = 50
+#: SYNCs in which a drive that does not follow its RPDOs may still hear of its end from them.
+_LAST_RPDOS = 5
 #: States in which a drive gives no torque until it is enabled anew.
 _DISABLED = (State.SWITCH_ON_DISABLED, State.FAULT)
 #: Cycles before enabling in which position and statusword have to arrive.
@@ -87,22 +91,29 @@ def run_loop(
             gc.enable()
             gc.unfreeze()
             outcome.cycles = loop.j
-    if not outcome.disabled and not outcome.trips:
-        outcome.trips.append("the drive did not confirm that it is disabled")
     return outcome
 
 
 def _leave(loop: "_Loop", outcome: Outcome) -> None:
+    """By the cycle; where that failed, or a trip gave cause for doubt, by SDO; at last by NMT."""
     try:
         outcome.disabled = loop.leave()
-        return
+        if outcome.disabled and not outcome.trips:
+            return
+        if not outcome.trips:
+            outcome.trips.append("the drive does not follow its RPDOs any more; SDO disabled it")
     except can.CanError as error:
         outcome.trips.append(f"the bus failed while leaving: {error}")
-    # The cycle is gone; SDO may still get through.
     try:
-        outcome.disabled = loop.disable_over_sdo()
+        loop.disable_over_sdo()
+        outcome.disabled = True
     except DriveError as error:
-        outcome.trips.append(f"the drive could not be disabled: {error}")
+        outcome.disabled = False
+        sent = "was sent" if loop.reset() else "could not be sent"
+        outcome.trips.append(
+            f"the drive did not confirm that it is disabled ({error}), NMT RESET NODE {sent}: "
+            f"switch it off before you touch it"
+        )
 
 
 class _Loop:
@@ -149,6 +160,7 @@ class _Loop:
                     silent = f"no TPDO for {_SILENT_CYCLES} cycles while enabling"
                     raise _WallGivenUpError(self._say(axis, silent))
             self._exchange.cycle()
+            self._check()
         for axis, way in zip(self._axes, ways, strict=True):
             if not _is_enabled(axis, way):
                 stays = f"the drive stays in {_state(axis)}{_emergency(axis)}"
@@ -223,7 +235,9 @@ class _Loop:
             for axis in self._axes:
                 axis.cycle["controlword"] = Controlword.QUICK_STOP
             self._exchange.cycle()
-        for _ in range(_LEAVE_CYCLES):
+        unheard = any(axis.cycle["trip"][0] == Trip.TORQUE for axis in self._axes)
+        patience = max(_LEAVE_CYCLES, round(_LEAVE_S / self._period))
+        for _ in range(_LAST_RPDOS if unheard else patience):
             for axis in self._axes:
                 state = state_of(int(axis.cycle["statusword"][0]))
                 axis.cycle["controlword"] = controlword_down(state)
@@ -234,20 +248,26 @@ class _Loop:
             self._exchange.cycle()
         return False
 
-    def disable_over_sdo(self) -> bool:
-        """Zero torque and no voltage without the cycle; whether the drives confirmed it."""
-        confirmed = []
+    def disable_over_sdo(self) -> None:
+        """No voltage and zero torque without the cycle. Raises DriveError, once all were asked."""
         failed: DriveError | None = None
         for axis in self._axes:
             try:
+                disable(axis.node)
                 axis.node.write(od.TARGET_TORQUE, 0, 0)
-                axis.node.write(od.CONTROLWORD, 0, Controlword.DISABLE_VOLTAGE)
-                confirmed.append(state_of(axis.node.read(od.STATUSWORD)) in _DISABLED)
             except DriveError as error:
                 failed = error
         if failed is not None:
             raise failed
-        return all(confirmed)
+
+    def reset(self) -> bool:
+        """The last resort: a drive that boots gives no torque. Whether the frames went out."""
+        try:
+            for axis in self._axes:
+                axis.node.command("RESET")
+        except can.CanError:
+            return False
+        return True
 
 
 def _change(axis: Axis, changes: list[Change], period: float) -> None:
@@ -309,22 +329,67 @@ def _emergency(axis: Axis) -> str:
 def _trip_text(axis: Axis) -> str:
     cycle, row = axis.cycle[0], axis.row[0]
     j = int(row["j"])
-    match Trip(int(cycle["trip"])):
+    trip = Trip(int(cycle["trip"]))
+    match trip:
         case Trip.SPEED:
             speed = float(cycle["estimator"]["v"][0])
             what = f"speed {speed:.3g} rad/s beyond limits.speed_rad_s"
         case Trip.POSITION:
             what = f"position {float(row['position_rad']):.4g} rad outside limits.position_rad"
+        case Trip.JUMP:
+            what = (
+                f"the position jumped by {abs(float(cycle['innovation'])):.3g} rad, more than "
+                f"{_jump_key(axis)} allows: look to the encoder and its cable"
+            )
+        case Trip.STUCK:
+            what = (
+                f"the position has not changed for {int(cycle['frozen'])} cycles, in which the "
+                f"handle should have moved by {abs(float(cycle['motion_missed'])):.2g} rad "
+                f"(limits.stuck_rad): look to the encoder"
+            )
+        case Trip.TORQUE:
+            what = (
+                f"the drive's torque (0x6077) has been {float(cycle['torque_error']):.3g} N·m off "
+                f"the target torque for {int(cycle['unfollowed'])} cycles, beyond "
+                f"limits.torque_error_nm"
+            )
         case Trip.ENERGY:
             energy = float(cycle["energy_out"])
             what = f"the wall has put out {energy:.3g} J in this contact, beyond limits.energy_j"
         case Trip.MISSED_TPDO:
-            what = f"no TPDO for {int(cycle['missed_in_a_row'])} cycles"
+            what = f"no TPDO for {int(cycle['missed_in_a_row'])} cycles{_too_short(axis)}"
         case Trip.NOT_ENABLED:
             what = f"the drive left OPERATION ENABLED: {_state(axis)}{_emergency(axis)}"
         case Trip.REPORTED:
             what = axis.reported
         case _:
             law = axis.laws[int(cycle["rendered"]["law"][0])].name
-            what = f"law {law} gave a force that is not a number"
+            what = f"law {law} failed, or gave a force that is not a number"
+    if trip in (Trip.NOT_ENABLED, Trip.REPORTED):
+        what += _pause(axis)
     return f"cycle {j} ({j * float(cycle['period']):.3f} s): {what}"
+
+
+def _jump_key(axis: Axis) -> str:
+    return "limits.jump_rad" if axis.limits.jump_rad else "limits.speed_rad_s"
+
+
+def _too_short(axis: Axis) -> str:
+    if axis.wrong_length is None:
+        return ""
+    tpdo = axis.setup.tpdo
+    return (
+        f" (0x{tpdo.cob_id:03X} came with {axis.wrong_length} bytes, {tpdo.length} carry what is "
+        f"mapped)"
+    )
+
+
+def _pause(axis: Axis) -> str:
+    """Why a drive has left where it was its master that was not there."""
+    watchdog, pause_s = axis.setup.watchdog, float(axis.row["sync_interval_s"][0])
+    if pause_s <= watchdog.time_s:
+        return ""
+    return (
+        f"; the master had stood still for {pause_s:.3g} s, the drive's watchdog "
+        f"({watchdog.kind}) waits for {watchdog.time_s * 1e3:g} ms"
+    )

@@ -54,6 +54,12 @@ class Trip(IntEnum):
     ENERGY = 6
     REPORTED = 7
     """Something that came over the bus beside the cycle: EMCY, heartbeat, error frame."""
+    JUMP = 8
+    """A position far from where the handle can have gone since the one before."""
+    STUCK = 9
+    """A position that stays the same to the count though the handle is moving."""
+    TORQUE = 10
+    """A torque actual value (0x6077) that does not follow the target torque."""
 
 
 # The enums' values as plain numbers for the compiled code.
@@ -64,8 +70,21 @@ _MISSED = int(Trip.MISSED_TPDO)
 _NOT_ENABLED = int(Trip.NOT_ENABLED)
 _NAN = int(Trip.NOT_A_NUMBER)
 _ENERGY = int(Trip.ENERGY)
+_JUMP = int(Trip.JUMP)
+_STUCK = int(Trip.STUCK)
+_TORQUE = int(Trip.TORQUE)
 _MEASURING = int(Phase.MEASURING)
+_LEAVING = int(Phase.LEAVING)
 _ENABLED_MASK, _ENABLED_VALUE = State.OPERATION_ENABLED.value
+#: Statusword bit 11, internal limit active: the drive says itself that it gives less.
+_INTERNAL_LIMIT = 1 << 11
+
+#: A coarse encoder rests on one count for long: less than so many counts are no motion missed.
+_STUCK_COUNTS = 8
+#: Rounding may be a count on either side of a cycle.
+_JUMP_COUNTS = 2
+#: Without [limits] torque_error_nm: parts of torque_nm, and per mille of the rated torque.
+_TORQUE_ERROR_PART, _TORQUE_ERROR_PER_MILLE = 0.1, 50.0
 
 _FIELD = [("shift", "i8"), ("bits", "i8")]
 
@@ -109,6 +128,11 @@ CYCLE = np.dtype(
         ("position_low", "f8"),
         ("position_high", "f8"),
         ("energy_limit", "f8"),
+        ("jump_limit", "f8"),
+        ("stuck_limit", "f8"),
+        ("stuck_cycles", "i8"),
+        ("torque_error_limit", "f8"),
+        ("torque_error_cycles", "i8"),
         ("hold_cycles", "i8"),
         ("ramp_cycles", "i8"),
         ("strike_gap", "i8"),
@@ -131,6 +155,18 @@ CYCLE = np.dtype(
         ("torque_actual", "i8"),
         ("torque_per_mille", "i8"),
         ("missed_in_a_row", "i8"),
+        # Whether the estimator knows where the handle is, and how far off it was this time.
+        ("started", "?"),
+        ("innovation", "f8"),
+        # Cycles since the position last changed, and the motion that was missed in them.
+        ("frozen", "i8"),
+        ("motion_missed", "f8"),
+        # Highest and lowest torque commanded of late [per mille]; cycles for which the torque
+        # actual value has been outside of them, and how far [N·m].
+        ("highest_sent", "f8"),
+        ("lowest_sent", "f8"),
+        ("unfollowed", "i8"),
+        ("torque_error", "f8"),
         ("oriented", "f8"),
         ("force_applied", "f8"),
         ("energy_out", "f8"),
@@ -210,6 +246,18 @@ def set_limits(cycle: NDArray[np.void], limits: Limits) -> None:
     cycle["speed_limit"] = limits.speed_rad_s
     cycle["position_low"], cycle["position_high"] = limits.position_rad
     cycle["energy_limit"] = limits.energy_j or math.inf
+    period, count = cycle["period"].item(), cycle["rad_per_count"].item()
+    jump = limits.jump_rad or limits.speed_rad_s * period
+    cycle["jump_limit"] = jump + _JUMP_COUNTS * abs(count)
+    stuck = max(limits.stuck_rad, _STUCK_COUNTS * abs(count))
+    cycle["stuck_limit"] = stuck if limits.stuck_rad else math.inf
+    cycle["stuck_cycles"] = limits.stuck_cycles
+    error = limits.torque_error_nm
+    if error is None:
+        rated_part = _TORQUE_ERROR_PER_MILLE * abs(cycle["nm_per_mille"].item())
+        error = max(_TORQUE_ERROR_PART * limits.torque_nm, rated_part)
+    cycle["torque_error_limit"] = error or math.inf
+    cycle["torque_error_cycles"] = limits.torque_error_cycles
     cycle["hold_cycles"] = limits.hold_cycles
     cycle["ramp_cycles"] = limits.ramp_cycles
 
@@ -258,6 +306,7 @@ def start_at(cycle: NDArray[np.void], counts: int) -> None:
     oriented = cycle["orientation"][0] * counts * cycle["rad_per_count"][0]
     reset_estimator(cycle["estimator"][0], oriented)
     cycle["oriented"] = cycle["rendered"]["y_before"] = oriented
+    cycle["started"] = True
 
 
 @compiled
@@ -365,12 +414,59 @@ def _watch(cycle: Record) -> None:
     position = cycle.counts * cycle.rad_per_count
     if not cycle.position_low <= position <= cycle.position_high:
         cycle.trip = _POSITION
+    elif abs(cycle.motion_missed) > cycle.stuck_limit and cycle.frozen == cycle.stuck_cycles:
+        cycle.trip = _STUCK
     elif not abs(cycle.estimator[0].v) <= cycle.speed_limit:
         cycle.trip = _SPEED
     elif cycle.statusword & _ENABLED_MASK != _ENABLED_VALUE:
         cycle.trip = _NOT_ENABLED
     elif cycle.energy_out > cycle.energy_limit:
         cycle.trip = _ENERGY
+    elif cycle.unfollowed >= cycle.torque_error_cycles:
+        cycle.trip = _TORQUE
+
+
+@compiled
+def _compare_position(cycle: Record, moved: bool, missed: int) -> None:
+    """How far the position is from the one expected; a jump is a trip before it is made use of.
+
+    The estimator expects it where the torques on their way and the force estimated take the
+    handle, after `missed` cycles without a sample as well.
+    """
+    cycle.innovation = cycle.oriented - cycle.estimator[0].y
+    if moved or missed or not cycle.started:
+        cycle.frozen = 0
+        cycle.motion_missed = 0.0
+    else:
+        cycle.frozen += 1
+        if cycle.frozen <= cycle.stuck_cycles:
+            cycle.motion_missed -= cycle.innovation
+    jumped = not abs(cycle.innovation) <= cycle.jump_limit * (1 + missed)
+    if jumped and cycle.started and cycle.phase != _LEAVING and cycle.trip == 0:
+        position = cycle.counts * cycle.rad_per_count
+        inside = cycle.position_low <= position <= cycle.position_high
+        cycle.trip = _JUMP if inside else _POSITION
+
+
+@compiled
+def _compare_torque(cycle: Record) -> None:
+    """Count the cycles in which 0x6077 is beyond everything that was commanded of late.
+
+    What is remembered of the commands fades within torque_error_cycles, so a current loop that
+    lags, or a torque actual value that is filtered, stays between its bounds.
+    """
+    sent = float(cycle.torque_per_mille)
+    fading = 2.0 / cycle.torque_error_cycles
+    cycle.highest_sent = max(sent, cycle.highest_sent + fading * (sent - cycle.highest_sent))
+    cycle.lowest_sent = min(sent, cycle.lowest_sent + fading * (sent - cycle.lowest_sent))
+    actual = float(cycle.torque_actual)
+    beyond = max(actual - cycle.highest_sent, cycle.lowest_sent - actual)
+    cycle.torque_error = beyond * abs(cycle.nm_per_mille)
+    limited = cycle.statusword & _INTERNAL_LIMIT
+    if cycle.torque_error > cycle.torque_error_limit and not limited:
+        cycle.unfollowed += 1
+    else:
+        cycle.unfollowed = 0
 
 
 @compiled
@@ -378,10 +474,10 @@ def _wanted_force(cycle: Record, received: bool, due: bool) -> float:
     """Force out of the wall from the instant of actuation on; sets the trip that ends it."""
     if received:
         _watch(cycle)
-        if cycle.trip:
-            return 0.0
     elif not cycle.trip:
         return _held_force(cycle)
+    if cycle.trip:
+        return 0.0
     if cycle.phase == _MEASURING:
         return cycle.orientation * cycle.test_per_mille * cycle.nm_per_mille
     force = _force_of(cycle, cycle.rendered[0], due)
@@ -434,8 +530,10 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     rendered = cycle.rendered[0]
     wall = rendered.wall[0]
     estimator = cycle.estimator[0]
+    before, missed = cycle.counts, cycle.missed_in_a_row
     if received:
         read_inputs(cycles, data)
+        _compare_torque(cycle)
         cycle.missed_in_a_row = 0
     else:
         cycle.torque_actual = cycle.torque_per_mille
@@ -443,6 +541,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
         cycle.missed_tpdo += 1
     _keep_books(cycle, received)
     if received:
+        _compare_position(cycle, cycle.counts != before, missed)
         observe(estimator, cycle.oriented)
     active = cycle.phase == _RENDERING or cycle.phase == _MEASURING
     due = _is_due(rendered, received) or (received and not active)

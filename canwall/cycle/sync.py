@@ -37,7 +37,8 @@ class ProducedSync:
 
     In real time its deadlines are a grid, k·T after the first: lateness does not add up, and a
     late cycle is not made up for by a burst of SYNCs. In simulated time the SYNCs follow one
-    another.
+    another. What has come before a SYNC goes to the network: a TPDO among it is late, or came
+    twice. Taken for the next one, it would leave every position after it a cycle old.
     """
 
     def __init__(
@@ -55,6 +56,8 @@ class ProducedSync:
         """Wait until the SYNC is due, and send it."""
         if self._real_time:
             self._wait()
+        else:
+            self._serve_all()
         if self._overflow:
             # CiA 301, 7.2.5.3: from 1 to the overflow value, and again from 1.
             self._counter = self._counter % self._overflow + 1
@@ -70,10 +73,15 @@ class ProducedSync:
         asleep_ns = self.deadline_ns - now - _SPIN_NS
         if asleep_ns > 0:
             time.sleep(asleep_ns * 1e-9)
+        self._serve_all()
         while time.perf_counter_ns() < self.deadline_ns:
             pass
         behind = max(0, time.perf_counter_ns() - self.deadline_ns) // self._period_ns
         self.deadline_ns += (behind + 1) * self._period_ns
+
+    def _serve_all(self) -> None:
+        while self._link.serve(0.0):
+            pass
 
 
 class ExternalSync:

@@ -3,20 +3,16 @@
 from collections.abc import Sequence
 
 import can
-import numpy as np
 from canopen.emcy import EmcyError
 
 from canwall.cycle.axis import Axis
-from canwall.cycle.step import Trip
 from canwall.drive import Link
-from canwall.record import Phase
 
 _EMCY, _ERROR_CONTROL = 0x080, 0x700
 _OPERATIONAL, _BOOT_UP = 5, 0
 _NMT_STATES = {_BOOT_UP: "restarted", 4: "is in NMT STOPPED", 127: "is in NMT PRE-OPERATIONAL"}
 #: Class of an error frame, as Linux's SocketCAN has it in the identifier (linux/can/error.h).
 _BUS_OFF = 0x40
-_ACTIVE = (Phase.RENDERING, Phase.MEASURING)
 
 
 class Watch:
@@ -41,41 +37,31 @@ class Watch:
     def _emergency(self, can_id: int, data: bytearray, timestamp: float) -> None:
         axis = self._axis(can_id - _EMCY)
         code = int.from_bytes(data[:2], "little")
-        if not _is_active(axis) or len(data) < 3 or code == 0:
+        if not axis.active or len(data) < 3 or code == 0:
             return
         error = EmcyError(code, data[2], bytes(data[3:]), timestamp)
         text = f"EMCY {code:#06x} ({error.get_desc() or 'of the maker'}), register {data[2]:#04x}"
         if axis.settings.limits.emergency == "trip":
-            _trip(axis, text)
+            axis.give_up(text)
         else:
             self.notes.append(f"{axis.name}: cycle {int(axis.cycle['j'][0])}: {text}")
 
     def _error_control(self, can_id: int, data: bytearray, timestamp: float) -> None:
         axis = self._axis(can_id - _ERROR_CONTROL)
-        if not _is_active(axis) or len(data) != 1 or data[0] & 0x7F == _OPERATIONAL:
+        if not axis.active or len(data) != 1 or data[0] & 0x7F == _OPERATIONAL:
             return
         state = data[0] & 0x7F
-        _trip(axis, f"the drive {_NMT_STATES.get(state, f'is in NMT state {state}')}")
+        axis.give_up(f"the drive {_NMT_STATES.get(state, f'is in NMT state {state}')}")
 
     def _another_sync(self, can_id: int, data: bytearray, timestamp: float) -> None:
         for axis in self._axes:
-            _trip(axis, f"somebody else sends SYNC ({can_id:#05x}) as well")
+            axis.give_up(f"somebody else sends SYNC ({can_id:#05x}) as well")
 
     def _error_frame(self, message: can.Message) -> None:
         self.error_frames += 1
         if message.arbitration_id & _BUS_OFF:
             for axis in self._axes:
-                _trip(axis, "the adapter is bus-off")
+                axis.give_up("the adapter is bus-off")
 
     def _axis(self, node_id: int) -> Axis:
         return next(axis for axis in self._axes if axis.node.node_id == node_id)
-
-
-def _is_active(axis: Axis) -> bool:
-    return int(axis.cycle["phase"][0]) in _ACTIVE
-
-
-def _trip(axis: Axis, text: str) -> None:
-    if _is_active(axis) and not axis.cycle["trip"][0]:
-        axis.reported = text
-        axis.cycle["trip"] = np.int64(Trip.REPORTED)

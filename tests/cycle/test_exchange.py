@@ -60,12 +60,33 @@ def test_emergencies_among_the_late_frames_are_heard(rig: Rig) -> None:
 def test_tpdo_that_is_too_short_is_none(rig: Rig) -> None:
     loop = Loop(rig)
     loop.exchange.cycle()
-    rig.drive_bus.send(can.Message(arbitration_id=TPDO1, data=bytes(7), is_extended_id=False))
+    out = rig.tampering._out
+    rig.tampering._out = lambda frames: [(i, data[:7]) for i, data in out(frames)]  # type: ignore[method-assign]
     loop.exchange.cycle()
+    rig.tampering._out = out  # type: ignore[method-assign]
     loop.exchange.cycle()
     rows = loop.rows()
     assert rows["received"].tolist() == [True, False, True]
     assert rows["counts"][1] == rows["counts"][0]
+
+
+def test_tpdo_that_comes_twice_or_late_is_not_taken_for_the_next(rig: Rig) -> None:
+    loop = Loop(rig)
+    loop.exchange.cycle()
+    stale = can.Message(arbitration_id=TPDO1, data=bytes(8), is_extended_id=False)
+    out = rig.tampering._out
+    rig.tampering._out = lambda frames: 2 * out(frames)  # type: ignore[method-assign]
+    for _ in range(3):
+        rig.drive_bus.send(stale)
+        loop.exchange.cycle()
+    while rig.bus.recv(0) is not None:
+        pass
+    rows = loop.rows()
+    assert rows["received"].all()
+    assert np.abs(np.diff(rows["counts"])).max() < 10
+    tpdos = [data for can_id, data in rig.frames if can_id == TPDO1 and any(data)]
+    # All but the last were taken off the bus before their successors.
+    assert len(tpdos) == 1 + 2 * 2 + 1
 
 
 def test_timing_columns(rig: Rig) -> None:

@@ -242,10 +242,152 @@ def test_speed_beyond_its_limit() -> None:
         wall.at(round(counts))
     assert wall.row["v_est"][0] == pytest.approx(-8.0, abs=1.5)
     assert wall.trip() == Trip.NONE
-    for j in range(50):
-        wall.at(1250 - 20 * j)
+    position = float(round(2500 - np.cumsum(speeds)[-1]))
+    for speed in np.linspace(8.0, 12.0, 100):
+        position -= speed
+        wall.at(round(position))
     assert wall.trip() == Trip.SPEED
-    assert wall.at(-100) == 0
+    assert wall.at(round(position)) == 0
+
+
+def moving(overrides: dict[str, Any], counts: int, speed: int, cycles: int = 60) -> Wall:
+    """A wall that the handle goes along at a steady speed [counts per cycle], outside of it."""
+    wall = Wall(overrides)
+    start_at(wall.cycle, counts)
+    for _ in range(cycles):
+        counts += speed
+        wall.at(counts)
+    assert wall.trip() == Trip.NONE
+    return wall
+
+
+@pytest.mark.parametrize("phase", [Phase.ENABLING, Phase.RENDERING])
+@pytest.mark.parametrize("missed", [0, 3])
+def test_position_that_jumps(phase: Phase, missed: int) -> None:
+    for counts, trip in ((12, Trip.NONE), (32 * (1 + missed) + 2, Trip.JUMP)):
+        for sign in (1, -1):
+            wall = Wall({"limits.jump_rad": 0.03, "limits.hold_cycles": 10})
+            wall.cycle["phase"] = phase
+            start_at(wall.cycle, 5)
+            for _ in range(20):
+                wall.at(5)
+            for _ in range(missed):
+                wall.missing()
+            torque = wall.at(5 + sign * counts)
+            assert wall.trip() == trip
+            assert torque == (350 if trip is Trip.NONE and sign < 0 and phase else 0)
+
+
+def test_jump_without_a_limit_of_its_own_is_what_the_speed_allows() -> None:
+    for counts, trip in ((18, Trip.NONE), (24, Trip.JUMP)):
+        wall = Wall({"limits.speed_rad_s": 20.0})
+        start_at(wall.cycle, 500)
+        for _ in range(20):
+            wall.at(500)
+        wall.cycle["speed_limit"] = 1e9  # the estimate makes of a jump whatever speed it likes
+        wall.at(500 + counts)
+        assert wall.trip() == trip
+
+
+def test_no_jump_before_the_first_position_nor_while_leaving() -> None:
+    wall = Wall({"limits.position_rad": [-9.0, 9.0], "limits.speed_rad_s": 1e9})
+    wall.cycle["jump_limit"] = 0.01
+    wall.at(2000)
+    assert wall.trip() == Trip.NONE
+    start_at(wall.cycle, 2000)
+    wall.cycle["phase"] = Phase.LEAVING
+    wall.at(1000)
+    assert wall.trip() == Trip.NONE
+    wall.cycle["phase"] = Phase.RENDERING
+    wall.at(2000)
+    assert wall.trip() == Trip.JUMP
+
+
+def test_position_that_stops_dead() -> None:
+    wall = moving({"limits.stuck_cycles": 4}, 2500, -20)
+    last = int(wall.cycle["counts"][0])
+    trips = []
+    for _ in range(5):
+        wall.at(last)
+        trips.append(wall.trip())
+    assert trips == [Trip.NONE] * 3 + [Trip.STUCK] * 2
+
+
+def test_position_that_stops_dead_where_that_is_not_watched() -> None:
+    wall = moving({"limits.stuck_rad": 0.0}, 2500, -20)
+    last = int(wall.cycle["counts"][0])
+    for _ in range(50):
+        wall.at(last)
+    assert wall.trip() == Trip.NONE
+
+
+@pytest.mark.parametrize("tremor", [0, 1])
+def test_handle_that_comes_to_rest_or_creeps_is_not_stuck(tremor: int) -> None:
+    wall = moving({}, 2500, -20)
+    counts = float(wall.cycle["counts"][0])
+    for j in range(400):
+        counts -= max(20.0 * 0.7**j, 0.02)
+        wall.at(round(counts) + tremor * (j % 2))
+    assert wall.trip() == Trip.NONE
+
+
+def with_torque(wall: Wall, counts: int, actual: int, statusword: int = ENABLED) -> None:
+    wall.give(counts & 0xFFFFFFFF | statusword << 32 | (actual & 0xFFFF) << 48)
+
+
+@pytest.mark.parametrize("error", [-130, 130])
+def test_torque_that_does_not_follow(error: int) -> None:
+    limits = {"limits.torque_error_nm": 0.1, "limits.torque_error_cycles": 8}
+    wall = Wall(limits)
+    for _ in range(40):
+        wall.at(-10)
+    trips = []
+    for _ in range(10):
+        with_torque(wall, -10, 500 + error)
+        trips.append(wall.trip())
+    assert trips == [Trip.NONE] * 7 + [Trip.TORQUE] * 3
+    for steady, statusword in ((error // 2, ENABLED), (error, ENABLED | 1 << 11)):
+        wall = Wall(limits)
+        for _ in range(40):
+            wall.at(-10)
+        for _ in range(40):
+            with_torque(wall, -10, 500 + steady, statusword)
+        assert wall.trip() == Trip.NONE
+
+
+def test_torque_error_without_a_limit_of_its_own() -> None:
+    # A tenth of the torque limit, and no less than 5 % of the rated torque, 1 N·m.
+    for limit, error in ((2.0, 0.2), (0.1, 0.05)):
+        wall = Wall({"limits.torque_nm": limit})
+        assert wall.cycle["torque_error_limit"][0] == pytest.approx(error)
+    wall = Wall({"limits.torque_error_nm": 0.0})
+    assert wall.cycle["torque_error_limit"][0] == np.inf
+
+
+@pytest.mark.parametrize("delay", [1, 3])
+def test_torque_that_lags_follows(delay: int) -> None:
+    """A chattering wall, a first-order lag of four cycles and a dead time."""
+    wall = Wall({"limits.torque_error_nm": 0.1})
+    actual, sent = 0.0, [0] * delay
+    for j in range(2000):
+        actual += (sent[-delay] - actual) / 4.0
+        with_torque(
+            wall, -round(10.0 + 10.0 * np.sin(j * 2.0 * np.pi / (10 + j // 20))), round(actual)
+        )
+        sent.append(wall.torque())
+    assert max(sent) > 900
+    assert wall.trip() == Trip.NONE
+
+
+@pytest.mark.parametrize("phase", [Phase.RENDERING, Phase.MEASURING])
+def test_no_torque_without_a_tpdo_once_something_has_ended_the_wall(phase: Phase) -> None:
+    wall = Wall()
+    wall.cycle["phase"] = phase
+    wall.cycle["test_per_mille"] = 100
+    wall.at(-10)
+    assert wall.torque() != 0
+    wall.cycle["trip"] = Trip.REPORTED
+    assert wall.missing() == 0
 
 
 def test_estimate_that_is_not_a_number_is_beyond_the_speed_limit() -> None:

@@ -1,0 +1,289 @@
+"""Whatever happens to the master: the torque goes, by the loop or by the drive's own watchdog.
+
+Two processes on unixcan, in real time, and a witness on the bus. Nothing here is measured by the
+clock: what counts is what is on the bus, and in which order (`scripts/bench ways_out` has times).
+"""
+
+import itertools
+import re
+import signal
+import struct
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import can
+import pytest
+from commands import (
+    COMMAND,
+    PATIENCE_S,
+    Record,
+    Start,
+    command,
+    config_file,
+    torque_is_on,
+    wait_for,
+)
+from rig import RPDO1, SDO_ANSWER, SDO_REQUEST, SYNC, Loop, RigFactory, eds_without, settings_with
+
+from canwall import config
+from canwall.record import Phase
+from canwall.record.folder import stream_of
+from canwall.run import stop_on_signals
+
+EMCY = 0x085
+ENABLE_OPERATION = 0x0F
+
+#: A hand that stays on the wall. A machine that has other things to do is not to be why the run
+#: ends: TPDOs may be missing for long, and the torque that is held meanwhile throws no handle.
+CHANGES = {
+    "cycle_s = 0.001": 'cycle_s = 0.001\npace = "real_time"',
+    "wait_s = 5.0": "wait_s = 20.0\nwatchdog_s = 0.5",
+    "hold_cycles = 2": "hold_cycles = 100",
+    "ramp_cycles = 10": "ramp_cycles = 1000\nlate_cycles = 0",
+    "stiffness_nm_per_rad = 50.0": "stiffness_nm_per_rad = 2.0",
+    "press_s = 0.5": "press_s = 3000.0",
+    "strikes = 4\n": "strikes = 1\n",
+    "interval_s = 1.0": "interval_s = 4000.0",
+    "duration_s = 4.2\n": "",
+}
+
+#: What the dictionary has to lack for a watchdog to be the strongest, and its EMCY.
+WATCHDOGS = {
+    "RPDO event timer": ((), 0x8250),
+    "consumer heartbeat": (("1400sub5",), 0x8130),
+    "life guarding": (("1400sub5", "1016"), 0x8130),
+}
+
+
+class Witness(can.Listener):
+    """Every frame on the bus, in order; asks the drive."""
+
+    def __init__(self, channel: Path) -> None:
+        self.bus = can.Bus(interface="unixcan", channel=str(channel))
+        self.frames: list[tuple[int, bytes]] = []
+        self._notifier = can.Notifier(self.bus, [self], timeout=0.05)
+
+    def on_message_received(self, msg: can.Message) -> None:
+        self.frames.append((msg.arbitration_id, bytes(msg.data)))
+
+    def close(self) -> None:
+        self._notifier.stop()
+        self.bus.shutdown()
+
+    def torque_is_on(self) -> bool:
+        """Whether the latest RPDO has a torque."""
+        rpdos = [data for can_id, data in self.frames[-50:] if can_id == RPDO1]
+        return bool(rpdos) and rpdo(rpdos[-1])[0] == ENABLE_OPERATION and rpdo(rpdos[-1])[1] != 0
+
+    def emergencies(self) -> list[int]:
+        return [int.from_bytes(d[:2], "little") for can_id, d in self.frames if can_id == EMCY]
+
+    def read(self, index: int) -> int:
+        """An object of the drive [unsigned 16 bits]."""
+        seen = len(self.frames)
+        request = struct.pack("<BHB4x", 0x40, index, 0)
+        self.bus.send(can.Message(arbitration_id=SDO_REQUEST, data=request, is_extended_id=False))
+
+        def answers() -> list[bytes]:
+            found = self.frames[seen:]
+            return [d for i, d in found if i == SDO_ANSWER and d[1:4] == request[1:4]]
+
+        wait_for(lambda: bool(answers()))
+        return int(struct.unpack_from("<H", answers()[0], 4)[0])
+
+    def assert_drive_gives_nothing(self) -> None:
+        assert self.read(0x6041) & 0x6F == 0x40
+        assert self.read(0x6077) == 0
+
+
+def rpdo(data: bytes) -> tuple[int, int]:
+    """Controlword and torque."""
+    controlword, torque = struct.unpack("<Hh", data)
+    return controlword, torque
+
+
+@contextmanager
+def walled(
+    start: Start, tmp_path: Path, watchdog: str = "RPDO event timer"
+) -> "Iterator[tuple[subprocess.Popen[str], Witness, Path]]":
+    """A master that presses back, its drive, and a witness; with the folder of the run."""
+    channel, folder = tmp_path / "bus", tmp_path / "run"
+    missing, _ = WATCHDOGS[watchdog]
+    eds = eds_without(tmp_path / "drive.eds", *missing)
+    changes = CHANGES | {'channel = "/tmp/canwall.sock"': f'channel = "{channel}"'}
+    file = config_file(tmp_path / "c.toml", changes, config.shipped("config/unixcan.toml"))
+    shipped = str(config.shipped("eds/canwall-drive.eds"))
+    file.write_text(file.read_text().replace(shipped, str(eds)))
+    drive = start(COMMAND, "drive", file, "--real-time")
+    assert drive.stdout is not None
+    assert drive.stdout.readline().startswith("simulated drive, node 5")
+    witness = Witness(channel)
+    try:
+        master = start(COMMAND, "run", file, "--output", folder)
+        wait_for(witness.torque_is_on)
+        yield master, witness, folder
+    finally:
+        witness.close()
+
+
+# The master is asked to end
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_signal_that_asks_for_the_end(start: Start, tmp_path: Path, number: int) -> None:
+    with walled(start, tmp_path) as (master, witness, folder):
+        master.send_signal(number)
+        _, errors = master.communicate(timeout=PATIENCE_S)
+        assert (master.returncode, errors) == (130, "")
+        witness.assert_drive_gives_nothing()
+        rpdos = [rpdo(data) for can_id, data in witness.frames if can_id == RPDO1]
+    # From the first word of the way down on there is no torque.
+    leaving = next(k for k, (word, _) in enumerate(rpdos) if k and word < rpdos[k - 1][0])
+    assert rpdos[leaving - 1][0] == ENABLE_OPERATION
+    assert {torque for _, torque in rpdos[leaving:]} == {0}
+    # No watchdog has bitten before: it misses the master only once that has gone.
+    ids = [can_id for can_id, _ in witness.frames]
+    assert EMCY not in ids[: len(ids) - ids[::-1].index(RPDO1)]
+    assert Record(folder).summary["interrupted"] is True
+
+
+def test_terminal_that_is_closed_under_nohup(start: Start, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    log = folder / "bus.log"
+    running = start("nohup", COMMAND, "run", "--duration", 3600, "--output", folder)
+    wait_for(lambda: torque_is_on(log))
+    running.send_signal(signal.SIGHUP)
+    size = log.stat().st_size
+    wait_for(lambda: log.stat().st_size > size + 100_000)
+    assert running.poll() is None
+    running.send_signal(signal.SIGTERM)
+    assert running.wait(PATIENCE_S) == 130
+
+
+def test_impatient_ctrl_c_while_the_drive_is_taken_down(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(settings_with({"wall.law": "half_sample"})))
+    note, pressed = loop.rig.link.log, 0
+    assert note is not None
+
+    def press(time_s: float, message: can.Message, received: bool) -> None:
+        nonlocal pressed
+        note(time_s, message, received)
+        if loop.record["j"][0] >= 500 and message.arbitration_id in (SYNC, RPDO1):
+            signal.raise_signal(signal.SIGINT)
+            pressed += 1
+
+    loop.rig.link.log = press
+    with stop_on_signals() as stop:
+        outcome = loop.run(None, lambda j: stop())
+    assert pressed > 5
+    assert outcome.interrupted
+    assert outcome.disabled
+    assert outcome.trips == []
+    words = [word for word, _ in loop.rig.rpdos()]
+    assert [word for word, _ in itertools.groupby(words)][-3:] == [0x07, 0x06, 0x00]
+    assert loop.rig.node.read(0x6041) & 0x6F == 0x40
+
+
+# The master is dead
+
+
+@pytest.mark.parametrize("watchdog", WATCHDOGS)
+def test_master_that_is_killed(start: Start, tmp_path: Path, watchdog: str) -> None:
+    _, code = WATCHDOGS[watchdog]
+    with walled(start, tmp_path, watchdog) as (master, witness, folder):
+        master.kill()
+        assert master.wait(PATIENCE_S) == -signal.SIGKILL
+        wait_for(lambda: witness.emergencies() == [code])
+        witness.assert_drive_gives_nothing()
+        last = [data for can_id, data in witness.frames if can_id == RPDO1][-1]
+        # It was not the master that took the torque away.
+        assert rpdo(last)[0] == ENABLE_OPERATION
+        assert rpdo(last)[1] != 0
+        assert (SYNC, b"") not in witness.frames[-3:]
+    # The record is complete all the same, up to the last cycle.
+    wait_for(lambda: complete(folder))
+    record = Record(folder)
+    assert record.column("j").tolist() == list(range(len(record.cycles)))
+    assert struct.pack("<h", record.column("torque_cmd_per_mille")[-1]) == last[2:]
+
+
+def complete(folder: Path) -> bool:
+    """Whether the writer is through: it has turned its stream into Parquet."""
+    names = {path.name for path in folder.iterdir()}
+    return (
+        names >= {"bus.log", "signals.parquet"}
+        and stream_of(folder / "signals.parquet").name not in names
+    )
+
+
+@pytest.mark.parametrize("watchdog", WATCHDOGS)
+def test_master_that_stands_still_for_longer_than_the_watchdog(
+    start: Start, tmp_path: Path, watchdog: str
+) -> None:
+    _, code = WATCHDOGS[watchdog]
+    with walled(start, tmp_path, watchdog) as (master, witness, folder):
+        master.send_signal(signal.SIGSTOP)
+        wait_for(lambda: witness.emergencies() == [code])
+        witness.assert_drive_gives_nothing()
+        seen = len(witness.frames)
+        master.send_signal(signal.SIGCONT)
+        _, errors = master.communicate(timeout=PATIENCE_S)
+        witness.assert_drive_gives_nothing()
+        after = [rpdo(data) for can_id, data in witness.frames[seen:] if can_id == RPDO1]
+    assert master.returncode == 1
+    (line,) = errors.splitlines()
+    assert re.search(
+        rf"EMCY {code:#x} \(.*\), register 0x\d\d; the master had stood still for [\d.]+ s, the "
+        rf"drive's watchdog \({watchdog}\) waits for 50\d ms$",
+        line,
+    )
+    # The answer to the TPDO before the pause may still go out, to a drive that is disabled.
+    assert all(torque == 0 for _, torque in after[1:])
+    assert Record(folder).summary["trips"] == [line.removeprefix("canwall: ")]
+
+
+# The record's writer is dead
+
+
+def test_writer_that_is_killed_takes_nothing_with_it(start: Start, tmp_path: Path) -> None:
+    with walled(start, tmp_path) as (master, witness, _):
+        (writer,) = Path(f"/proc/{master.pid}/task/{master.pid}/children").read_text().split()
+        subprocess.run(["kill", "-KILL", writer], check=True)
+        seen = len(witness.frames)
+        wait_for(lambda: len(witness.frames) > seen + 300)
+        assert witness.torque_is_on()
+        master.send_signal(signal.SIGINT)
+        _, errors = master.communicate(timeout=PATIENCE_S)
+        witness.assert_drive_gives_nothing()
+    assert master.returncode == 1
+    assert "the writer of the record did not finish" in errors
+    assert len(errors.splitlines()) == 1
+
+
+# The law fails
+
+
+@pytest.mark.parametrize(
+    "body",
+    ["return math.nan", "return wall.options[int(1e6 * wall.y_sample)]", 'raise ValueError("no")'],
+)
+def test_law_that_fails_in_the_contact(tmp_path: Path, body: str) -> None:
+    file = tmp_path / "failing.py"
+    file.write_text(
+        "import math\n\ndef failing(wall):\n    if wall.y_sample < -0.002:\n        "
+        f"{body}\n    return -wall.stiffness * wall.y_sample\n"
+    )
+    folder = tmp_path / "run"
+    done = command("run", "--law", f"{file}:failing", "--duration", 1, "--output", folder)
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert line.endswith(f"law {file}:failing failed, or gave a force that is not a number")
+    record = Record(folder)
+    trip = record.summary["trip_cycle"]
+    torques = record.column("torque_cmd_per_mille")
+    assert torques[trip - 1] != 0
+    assert not torques[trip:].any()
+    assert record.column("phase")[trip] == Phase.RENDERING
+    assert int(record.column("statusword")[-1]) & 0x6F == 0x40
