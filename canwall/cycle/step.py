@@ -22,6 +22,7 @@ from canwall.walls import (
     TENSION,
     WALL,
     Law,
+    acting_force,
     actuation_state,
     commit,
     find_law,
@@ -502,7 +503,6 @@ def _keep_books(cycle: Record, received: bool) -> None:
     if received:
         cycle.energy_out += cycle.force_applied * (oriented - cycle.oriented)
     cycle.oriented = oriented
-    cycle.force_applied = cycle.orientation * cycle.torque_actual * cycle.nm_per_mille
     inside = oriented < cycle.orientation * cycle.rendered[0].position
     if not inside and cycle.force_applied == 0.0:
         cycle.energy_out = 0.0
@@ -553,6 +553,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     per_mille = to_per_mille(cycle.orientation * force, cycle.nm_per_mille, cycle.torque_limit)
     torque = per_mille * cycle.nm_per_mille
     commit(estimator, cycle.orientation * torque)
+    cycle.force_applied = acting_force(estimator)
     if due:
         note_force(wall, cycle.orientation * torque)
         note_force(cycle.faded[0].wall[0], cycle.orientation * torque)
@@ -573,7 +574,8 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     row.force = force
     row.torque_cmd_per_mille = per_mille
     row.torque_cmd = torque
-    row.torque_applied = cycle.torque_actual * cycle.nm_per_mille
+    row.torque_applied = cycle.orientation * cycle.force_applied
+    row.torque_actual = cycle.torque_actual * cycle.nm_per_mille
     row.force_applied = cycle.force_applied
     row.law = rendered.law
     row.stiffness = wall.stiffness

@@ -43,7 +43,8 @@ ROW = np.dtype(
         ("force", "f8"),  # what the law wants from the instant of actuation on
         ("torque_cmd_per_mille", "i2"),  # 0x6071 as sent
         ("torque_cmd", "f8"),  # the same in N·m, drive's axis
-        ("torque_applied", "f8"),  # in force from this SYNC on [N·m], drive's axis
+        ("torque_actual", "f8"),  # 0x6077 in N·m, drive's axis
+        ("torque_applied", "f8"),  # in force from this SYNC to the next [N·m], drive's axis
         ("force_applied", "f8"),  # the same, out of the wall
         ("law", "u1"),  # index into the laws of the run
         ("stiffness", "f8"),

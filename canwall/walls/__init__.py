@@ -7,6 +7,7 @@ out of it. Nothing here knows of CAN, counts or drives.
 from canwall.walls.estimator import (
     ESTIMATOR,
     MAX_DELAY,
+    acting_force,
     actuation_state,
     commit,
     observe,
@@ -35,6 +36,7 @@ __all__ = [
     "WALL",
     "Law",
     "UnknownLawError",
+    "acting_force",
     "actuation_state",
     "call_law",
     "commit",

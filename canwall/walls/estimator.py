@@ -161,3 +161,14 @@ def commit(estimator: Record, force: float) -> None:
     estimator.y, estimator.v = _hold(
         estimator, estimator.after[0], y, v, committed[n] + estimator.d
     )
+
+
+@compiled
+def acting_force(estimator: Record) -> float:
+    """Mean of the force from this sample to the next, of those committed; after `commit`."""
+    n = estimator.delay_periods
+    share = estimator.before[0].duration / estimator.full[0].duration
+    force = estimator.committed[n]
+    if share > 0.0:
+        force = share * estimator.committed[n + 1] + (1.0 - share) * force
+    return force

@@ -109,7 +109,7 @@ def test_values_are_taken_from_any_layout(layout: PdoLayout, data: int) -> None:
     assert wall.row["counts"][0] == value_of(data, layout.field(POSITION), signed=True)
     assert wall.row["statusword"][0] == value_of(data, layout.field(STATUSWORD), signed=False)
     torque = value_of(data, layout.field(TORQUE), signed=True)
-    assert wall.row["torque_applied"][0] == torque * UNITS.nm_per_mille
+    assert wall.row["torque_actual"][0] == torque * UNITS.nm_per_mille
 
 
 @settings(deadline=None, max_examples=80)
