@@ -93,6 +93,7 @@ def set_up(
     node.write(od.TARGET_TORQUE, 0, 0)
     node.confirm(od.TARGET_TORQUE, 0, 0)
     _set_interpolation_period(node, bus.cycle_s, notes)
+    _settle_sync(node, bus.cycle_s, real_time, notes)
     immediate = settings.torque_pdo == "immediate"
     tpdo = configure_tpdo(node, _MEASURED, _MEASURED_TOO, notes)
     rpdo = configure_rpdo(node, _COMMANDED, immediate, notes)
@@ -159,6 +160,24 @@ def _download_dcf(node: DriveNode) -> None:
         if variable.index in _COMMANDED or "w" not in variable.access_type:
             continue
         node.change(variable.index, variable.subindex, variable.value)
+
+
+def _settle_sync(node: DriveNode, cycle_s: float, real_time: bool, notes: list[str]) -> None:
+    """What the drive expects of the SYNC: its period where it watches it (0x1006), no window.
+
+    An RPDO after the synchronous window (0x1007) is dropped without a word; without one, a late
+    torque acts a cycle later, is counted, and in the end trips (limits.late_cycles). In simulated
+    time SYNC has no period by the clock.
+    """
+    wanted = {od.SYNCHRONOUS_WINDOW: 0}
+    if node.has(od.COMMUNICATION_CYCLE_PERIOD) and node.read(od.COMMUNICATION_CYCLE_PERIOD):
+        wanted[od.COMMUNICATION_CYCLE_PERIOD] = round(cycle_s * 1e6) if real_time else 0
+    for index, value in wanted.items():
+        if node.has(index) and node.read(index) != value:
+            try:
+                node.set(index, 0, value)
+            except DriveError as error:
+                notes.append(f"0x{index:04X} stays as it is: {error}")
 
 
 def _set_interpolation_period(node: DriveNode, cycle_s: float, notes: list[str]) -> None:
