@@ -3,9 +3,11 @@
 import math
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
+import numpy as np
 import typer
 from can import CanError
 from rich.console import Console
@@ -18,6 +20,8 @@ from canwall.config import ConfigError, Settings, absolute_law
 from canwall.errors import InputError, RunFailedError
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from canwall.bench import Findings
 
 app = typer.Typer(
@@ -231,14 +235,95 @@ def _show_findings(findings: "Findings") -> None:
 
 
 @app.command()
-def plot(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")],
+def sweep(
+    config_file: Annotated[Path, typer.Argument(metavar="CONFIG", help="A TOML file.")],
+    output: Annotated[Path, typer.Option(metavar="FILE.nc", help="NetCDF file of the result.")],
+    law: Annotated[list[str] | None, typer.Option(help="A law; may be repeated.")] = None,
+    stiffness: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LO:HI:N", help="K [N·m/rad]; without any, the K-limits are searched."
+        ),
+    ] = None,
+    damping: Annotated[str | None, typer.Option(metavar="LO:HI:N", help="B [N·m·s/rad].")] = None,
+    rate: Annotated[str | None, typer.Option(metavar="LO:HI:N", help="Rate [Hz].")] = None,
+    operator: Annotated[
+        list[str] | None, typer.Option(help="none, finger, grip, hand; may be repeated.")
+    ] = None,
+    axis: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUES",
+            help="Any other axis: a key of the configuration, or delay, counts, torque_step, "
+            "model, model_error, servo, speed, phase, press, stiffness_normalised, "
+            "damping_normalised; VALUES: A,B,C or LO:HI:N.",
+        ),
+    ] = None,
+    through: Annotated[str, typer.Option(help="sim: in memory; bus: by frames.")] = "sim",
+    workers: Annotated[int | None, typer.Option(min=1, help="Cores; without: all.")] = None,
+    dask: Annotated[str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler.")] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with a sweep that was interrupted.")
+    ] = False,
 ) -> int:
-    """Draw the picture of a recorded run again."""
+    """How stiff the wall can be: strikes over any axes, or the K-limit at each of their points."""
+    given: dict[str, object] = {}
+    for name, equals, values in (text.partition("=") for text in axis or []):
+        if not equals or name in given:
+            raise InputError(f"--axis {name}: has to be NAME=VALUES, each name once")
+        given[name] = values
+    named = {
+        "law": law and [absolute_law(name, Path()) for name in law],
+        "stiffness": stiffness,
+        "damping": damping,
+        "rate": rate,
+        "operator": operator,
+    }
+    given |= {name: values for name, values in named.items() if values}
+    settings = _settings(config_file)
+    from canwall.sweep import make_plan
+    from canwall.sweep import sweep as swept
+
+    with _RunProgress() as shown:
+        plan = make_plan(settings, given, through)
+        try:
+            dataset = swept(plan, output, resume, workers, dask, partial(shown.count, "sweeping"))
+        except KeyboardInterrupt:
+            raise _Interrupted(f"interrupted; --resume goes on with {output}") from None
+    if "worst" in dataset:
+        _console.print(_limit_table(dataset))
+    _console.print(f"{plan.points_in_all} points: {output}", soft_wrap=True, highlight=False)
+    return 0
+
+
+def _limit_table(dataset: "xr.Dataset") -> Table:
+    """K-limits, a row for each condition."""
+    worst = dataset["worst"]
+    table = Table(title="K-limits", title_justify="left")
+    shown = [str(dim) for dim in worst.dims if worst.sizes[dim] > 1 or dim == "law"]
+    for name in (*shown, "K\n\\[N·m/rad]", "K·T²/m", "spread"):
+        table.add_column(name, justify="left" if name == "law" else "right", no_wrap=True)
+    limit = dataset["limit"]
+    spread = limit.max(("speed", "phase")) / worst
+    normalised = dataset["worst_normalised"]
+    for at in np.ndindex(*worst.shape):
+        where = dict(zip(map(str, worst.dims), at, strict=True))
+        values = [dataset[name].values[where[name]] for name in shown]
+        cells = [v if isinstance(v, str) else f"{v:g}" for v in values]
+        numbers = (worst.values[at], normalised.values[at], spread.values[at])
+        table.add_row(*map(escape, cells), *(f"{x:.3g}" for x in numbers))
+    return table
+
+
+@app.command()
+def plot(
+    what: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")],
+) -> int:
+    """Draw the picture of a recorded run again, or the figures of a sweep."""
     from canwall.plots import plot_run
     from canwall.record import RunFolder
 
-    _console.print(str(plot_run(RunFolder(folder))), soft_wrap=True, highlight=False)
+    _console.print(str(plot_run(RunFolder(what))), soft_wrap=True, highlight=False)
     return 0
 
 
@@ -356,6 +441,7 @@ class _RunProgress:
         self._progress.update(self._task, completed=now_s, total=end_s, clock=clock)
 
     def count(self, what: str, done: int, total: int) -> None:
+        """So many steps of so many."""
         clock = f"{done} of {total}"
         self._progress.update(
             self._task, description=what, completed=done, total=total, clock=clock
@@ -387,6 +473,10 @@ def _strike_table(strikes: list[dict[str, Any]]) -> Table:
     return table
 
 
+class _Interrupted(KeyboardInterrupt):
+    """Ctrl-C, and what to say of it."""
+
+
 def _error(text: str) -> None:
     _errors.print(f"canwall: {text}", markup=False)
 
@@ -400,6 +490,9 @@ def _guarded(command: Callable[[], object]) -> int:
     """Every error as one line; a traceback is a bug."""
     try:
         result = command()
+    except _Interrupted as interrupted:
+        _error(str(interrupted))
+        return INTERRUPTED
     except (KeyboardInterrupt, typer.Abort):
         return INTERRUPTED
     except typer.TyperException as error:

@@ -7,8 +7,9 @@ each SYNC to the next, positive out of the wall. See theory, section 5.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
+
+from canwall.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -80,6 +81,7 @@ class Chatter:
     reason: str
 
 
+@compiled
 def amplitude_tolerance(stiffness: float, count: float, force_step: float) -> float:
     """Motion that quantisation alone explains: max(6·Δ, 3·f_LSB/K) [rad or m]."""
     return max(6.0 * count, 3.0 * force_step / stiffness if stiffness > 0.0 else 0.0)
@@ -95,11 +97,11 @@ def chatter(
     own, or EVENTS_OF_CHATTER makes and breaks within EVENT_WINDOW_S that the referent does not
     make. Without a referent (a person at the handle) only the events can be judged.
     """
-    window = max(1, round(EVENT_WINDOW_S / cycle_s))
     # A wall that loses some energy bounces as its referent does, only earlier: it is the busiest
     # window of each that is compared, not window by window.
-    events = _events(y, window, count)
-    expected = 0 if referent is None else _events(referent, window, count)
+    window = event_window(cycle_s)
+    events = most_events(y, window, count)
+    expected = 0 if referent is None else most_events(referent, window, count)
     if events - expected >= EVENTS_OF_CHATTER:
         compared = "without a referent" if referent is None else f"the referent {expected}"
         return Chatter(
@@ -108,58 +110,104 @@ def chatter(
         )
     if referent is None:
         return Chatter(False, "too few makes and breaks; amplitude not judged without a referent")
-    settled = settled_stretch(referent, tolerance)
-    if (settled.stop - settled.start) * cycle_s < SETTLED_S:
+    start, stop = rest_of(referent, tolerance, cycle_s)
+    if start == stop:
         return Chatter(False, "the referent never settles; amplitude not judged")
-    # The wall may come to rest somewhat later than the referent, and leave its rest somewhat
-    # before it: what lasts is judged, over the middle of the stretch.
-    length = settled.stop - settled.start
-    rest = slice(settled.start + length // 2, settled.start + length * 9 // 10)
-    measured, own = float(np.ptp(y[rest])), float(np.ptp(referent[rest]))
+    measured, own = peak_to_peak(y[start:stop]), peak_to_peak(referent[start:stop])
     compared = f"{measured:.3g} peak to peak about the settled contact, referent {own:.3g}"
     return Chatter(measured - own > tolerance, f"{compared}, quantisation explains {tolerance:.3g}")
 
 
-def _events(y: Array, window: int, count: float) -> int:
+@compiled
+def event_window(cycle_s: float) -> int:
+    """EVENT_WINDOW_S in cycles."""
+    return max(1, round(EVENT_WINDOW_S / cycle_s))
+
+
+@compiled
+def most_events(y: Array, window: int, count: float) -> int:
     """The most makes and breaks of contact within any window of cycles.
 
     Contact is made below 0 and broken above one count: to and fro between two counts at the
     surface, as the last bit of a resting encoder may go, is neither.
     """
-    side = np.where(y < 0.0, -1, np.where(y > count, 1, 0))
-    decided = np.flatnonzero(side)
-    changes = np.zeros(len(y), np.int64)
-    changes[decided[1:]] = side[decided[1:]] != side[decided[:-1]]
-    if len(changes) <= window:
-        return int(changes.sum())
-    return int(sliding_window_view(changes, window).sum(axis=1).max())
+    changed = np.zeros(len(y), np.bool_)
+    side = within = most = 0
+    for j in range(len(y)):
+        now = -1 if y[j] < 0.0 else (1 if y[j] > count else 0)
+        if now != 0:
+            changed[j] = side != 0 and now != side
+            side = now
+        within += changed[j]
+        if j >= window:
+            within -= changed[j - window]
+        most = max(most, within)
+    return most
 
 
-def settled_stretch(referent: Array, tolerance: float) -> slice:
-    """The longest stretch, inside the wall, over which the referent stays within `tolerance`."""
-    best = slice(0, 0)
-    start, low, high = 0, np.inf, -np.inf
-    for j, position in enumerate(referent):
+@compiled
+def _settled(referent: Array, tolerance: float) -> tuple[int, int]:
+    best_start = best_stop = start = 0
+    low, high = np.inf, -np.inf
+    for j in range(len(referent)):
+        position = referent[j]
         low, high = min(low, position), max(high, position)
         if position >= 0.0:
             start, low, high = j + 1, np.inf, -np.inf
         elif high - low > tolerance:
             # Begin anew after the last position that is too far from this one.
-            far = np.abs(referent[start : j + 1] - position) > tolerance
-            start += int(np.flatnonzero(far)[-1]) + 1
-            low, high = float(referent[start : j + 1].min()), float(referent[start : j + 1].max())
-        if j + 1 - start > best.stop - best.start:
-            best = slice(start, j + 1)
-    return best
+            low = high = position
+            start = j
+            while abs(referent[start - 1] - position) <= tolerance:
+                start -= 1
+                low, high = min(low, referent[start]), max(high, referent[start])
+        if j + 1 - start > best_stop - best_start:
+            best_start, best_stop = start, j + 1
+    return best_start, best_stop
 
 
+def settled_stretch(referent: Array, tolerance: float) -> slice:
+    """The longest stretch, inside the wall, over which the referent stays within `tolerance`."""
+    return slice(*_settled(referent, tolerance))
+
+
+@compiled
+def rest_of(referent: Array, tolerance: float, cycle_s: float) -> tuple[int, int]:
+    """First cycle, and the one after the last, over which a settled contact is judged.
+
+    (0, 0) where the referent settles for less than SETTLED_S. The wall may come to rest somewhat
+    later than the referent, and leave its rest somewhat before it: what lasts is judged, over the
+    middle of the stretch.
+    """
+    start, stop = _settled(referent, tolerance)
+    length = stop - start
+    if length * cycle_s < SETTLED_S:
+        return 0, 0
+    return start + length // 2, start + length * 9 // 10
+
+
+@compiled
+def peak_to_peak(y: Array) -> float:
+    """Largest less smallest; 0 of nothing."""
+    if len(y) == 0:
+        return 0.0
+    low = high = y[0]
+    for value in y:
+        low, high = min(low, value), max(high, value)
+    return high - low
+
+
+@compiled
 def limit_cycle(y: Array, cycle_s: float) -> tuple[float, float]:
     """Amplitude (half peak to peak) and frequency [Hz] (upward crossings of the mean) of y."""
     if len(y) < 2:
         return 0.0, 0.0
-    above = y > y.mean()
-    rises = np.flatnonzero(above[1:] & ~above[:-1])
-    frequency = 0.0
-    if len(rises) > 1:
-        frequency = (len(rises) - 1) / ((rises[-1] - rises[0]) * cycle_s)
-    return float(np.ptp(y)) / 2.0, float(frequency)
+    mean = y.mean()
+    rises, first, last = 0, 0, 0
+    for j in range(1, len(y)):
+        if y[j] > mean and not y[j - 1] > mean:
+            first = j if rises == 0 else first
+            last = j
+            rises += 1
+    frequency = (rises - 1) / ((last - first) * cycle_s) if rises > 1 else 0.0
+    return 0.5 * peak_to_peak(y), frequency

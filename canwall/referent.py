@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from canwall import simdrive
 from canwall.compiled import Record, compiled
-from canwall.config import Settings
+from canwall.config import Settings, Simulation
 from canwall.physics import Force, Grasp, Hand, advance, advance_grasp, make_plant
 
 Array = NDArray[np.float64]
@@ -24,25 +24,40 @@ def referent_positions(
     """
     if settings.simulation is None:
         return None
-    simulation, period = settings.simulation, settings.bus.cycle_s
-    hand = simulation.hand
-    side = 1.0 if settings.wall.side == "below" else -1.0
-    origin = side * wall_position
-    constant, slope = simdrive.hand_force(hand, period, len(stiffness))
-    # Measured from the wall, the hand's spring pulls from another place.
-    pull = side * constant - hand.stiffness_nm_per_rad * origin
-    y = np.empty(len(stiffness))
-    y[0] = side * hand.rest_rad - origin[0]
-    wall = (stiffness, damping, origin)
-    joined = make_plant(**simdrive.hand_plant(simulation))
-    if hand.grip:
-        _follow(joined, *wall, pull, side * slope, period, y)
-    else:
+    return Referent(settings, settings.simulation, len(stiffness)).positions(
+        stiffness, damping, wall_position
+    )
+
+
+class Referent:
+    """The hand and the handle of a configuration, to be followed against one wall or several."""
+
+    def __init__(self, settings: Settings, simulation: Simulation, cycles: int) -> None:
+        self._period = settings.bus.cycle_s
+        self._hand = simulation.hand
+        self._side = 1.0 if settings.wall.side == "below" else -1.0
+        self._constant, slope = simdrive.hand_force(simulation.hand, self._period, cycles)
+        self._slope = self._side * slope
+        self._handle = make_plant(**simdrive.handle_plant(simulation))
+        self._joined = make_plant(**simdrive.hand_plant(simulation))
         body = simdrive.hand_body(simulation)
-        body = body._replace(side=side * body.side)
-        handle = make_plant(**simdrive.handle_plant(simulation))
-        _follow_apart(handle, joined, body, *wall, pull, side * slope, period, y)
-    return y
+        self._body = body._replace(side=self._side * body.side)
+
+    def positions(self, stiffness: Array, damping: Array, wall_position: Array) -> Array:
+        """As `referent_positions`."""
+        origin = self._side * wall_position
+        # Measured from the wall, the hand's spring pulls from another place.
+        pull = self._side * self._constant - self._hand.stiffness_nm_per_rad * origin
+        y = np.empty(len(stiffness))
+        y[0] = self._side * self._hand.rest_rad - origin[0]
+        wall = (stiffness, damping, origin)
+        joined = self._joined.copy()
+        if self._hand.grip:
+            _follow(joined, *wall, pull, self._slope, self._period, y)
+        else:
+            handle = self._handle.copy()
+            _follow_apart(handle, joined, self._body, *wall, pull, self._slope, self._period, y)
+        return y
 
 
 @compiled

@@ -7,7 +7,7 @@ is a `ConfigError` of one line: file, key, what is wrong, what to do.
 from canwall.config.drive import Drive
 from canwall.config.fault import AMOUNTS, NUMBERS, ON_FRAMES, Direction, Fault, FaultName
 from canwall.config.hand import Hand, Move, RandomStrikes
-from canwall.config.reading import ConfigError, absolute_law, first_error, load, shipped
+from canwall.config.reading import ConfigError, absolute_law, first_error, load, overridden, shipped
 from canwall.config.settings import (
     Bus,
     Change,
@@ -48,5 +48,6 @@ __all__ = [
     "absolute_law",
     "first_error",
     "load",
+    "overridden",
     "shipped",
 ]

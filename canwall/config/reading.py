@@ -78,6 +78,24 @@ def load(path: Path, overrides: Mapping[str, Any] | None = None) -> Settings:
     return _with_absolute_paths(settings, path.parent)
 
 
+def overridden(settings: Settings, values: Mapping[str, Any]) -> Settings:
+    """The settings with other values under dotted keys, validated anew. Raises ConfigError."""
+    raw = settings.model_dump()
+    for dotted, value in values.items():
+        *sections, key = dotted.split(".")
+        table = raw
+        for section in sections:
+            inner = table.get(section)
+            if not isinstance(inner, dict):
+                raise ConfigError(f"{dotted}: there is no [{section}]")
+            table = inner
+        table[key] = value
+    try:
+        return Settings.model_validate(raw)
+    except ValidationError as error:
+        raise ConfigError(first_error(error)) from None
+
+
 def _with_absolute_paths(settings: Settings, base: Path) -> Settings:
     """The files that a configuration names, independent of where it lies."""
     drive = settings.drive.model_copy(update={"eds": (base / settings.drive.eds).resolve()})

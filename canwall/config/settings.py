@@ -8,6 +8,7 @@ from pydantic import Field, field_validator, model_validator
 from canwall.config.drive import Drive
 from canwall.config.section import Names, NonNegative, Number, Positive, Section
 from canwall.config.simulation import Simulation
+from canwall.config.sweep import AxisValues
 
 
 class Bus(Section):
@@ -174,6 +175,7 @@ class Settings(Section):
     run: Run = Run()
     simulation: Simulation | None = None
     schedule: tuple[Scheduled, ...] = ()
+    sweep: dict[str, AxisValues] = Field(default_factory=dict)
 
     @field_validator("schedule", mode="before")
     @classmethod

@@ -5,6 +5,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, field_validator
 
+from canwall.config.drive import Objects, by_index
 from canwall.config.fault import Fault
 from canwall.config.hand import Hand
 from canwall.config.section import NonNegative, Number, Positive, Section
@@ -13,7 +14,8 @@ from canwall.config.section import NonNegative, Number, Positive, Section
 class Simulation(Section):
     """`[simulation]`: the mechanics of the simulated drive, and the hand on its handle.
 
-    Rated torque and encoder are those of the dictionary (0x6076, 0x608F) where it has them. The
+    `objects` are power-on values that go before those of the dictionary's file. Rated torque and
+    encoder are those of the dictionary (0x6076, 0x608F) where it has them. The
     motor's torque has its limit at `peak_torque_nm` (three times the rated torque, unless given),
     and falls back to the rated torque when the peak has lasted for `overload_s`, or less of it for
     longer (I²t). The limit switches are closed outside `limit_switches_rad`, the home switch
@@ -30,6 +32,7 @@ class Simulation(Section):
     The faults are those of one `seed`.
     """
 
+    objects: Objects = Field(default_factory=dict)
     rated_torque_nm: Annotated[Positive, Field(ge=0.001)] = 0.637
     counts_per_rev: int = Field(131072, gt=0, lt=2**31)
     inertia_kg_m2: Positive = 1.0e-4
@@ -73,6 +76,11 @@ class Simulation(Section):
     @classmethod
     def _path(cls, value: object) -> object:
         return Path(value) if isinstance(value, str) else value
+
+    @property
+    def written(self) -> dict[tuple[int, int], int]:
+        """`objects` by index and sub-index."""
+        return by_index(self.objects)
 
     def with_ideal_servo(self) -> Self:
         """The same mechanics behind a motor without cogging that gives any torque at once."""

@@ -1,6 +1,6 @@
 """A CiA 402 servo drive that exists on the CAN bus alone: frames in, frames out."""
 
-from canwall.simdrive.build import make_drive, servo_scales
+from canwall.simdrive.build import TORQUE_LIMITS, ServoScales, make_drive, servo_scales
 from canwall.simdrive.communication.dictionary import Dictionary
 from canwall.simdrive.communication.frame import Frame
 from canwall.simdrive.drive import SimulatedDrive
@@ -21,6 +21,7 @@ from canwall.simdrive.runner import BusRunner, Device
 
 __all__ = [
     "SERVO",
+    "TORQUE_LIMITS",
     "BusRunner",
     "Device",
     "Dictionary",
@@ -28,6 +29,7 @@ __all__ = [
     "Frame",
     "Motion",
     "ServoMotion",
+    "ServoScales",
     "SimulatedDrive",
     "encoder_counts",
     "hand_body",

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 from canwall.config import Drive as DriveSettings
 from canwall.config import Simulation
@@ -15,6 +16,9 @@ from canwall.simdrive.profile.position_unit import quotient
 
 _SERVO_DRIVE = 0x20192
 """Device type: profile 402, servo drive."""
+
+TORQUE_LIMITS = (0x6072, 0x6073, 0x60E0, 0x60E1)
+"""Objects that hold the torque, in per mille of the rated one."""
 
 
 def make_drive(
@@ -55,19 +59,38 @@ def make_drive(
     return FaultyDrive(simulated, encoder, faults, simulation.seed, report)
 
 
-def servo_scales(drive: DriveSettings, simulation: Simulation) -> tuple[float, int]:
-    """Encoder increments per turn of the shaft, and rated torque at the motor [mN·m].
+class ServoScales(NamedTuple):
+    """What a drive's numbers mean.
 
-    Those of the drive that `make_drive` makes. Raises DictionaryError.
+    counts_per_rev: encoder increments per turn of the shaft. rated_torque_mnm: at the motor.
+    gear_ratio: turns of the motor per turn of the shaft. torque_limit_per_mille: what the drive
+    shows as its limit.
     """
+
+    counts_per_rev: float
+    gear_ratio: float
+    rated_torque_mnm: int
+    torque_limit_per_mille: float
+
+
+def servo_scales(drive: DriveSettings, simulation: Simulation) -> ServoScales:
+    """Scales of the drive that `make_drive` makes. Raises DictionaryError."""
     dictionary = _dictionary(drive, simulation, drive.node_id)
-    counts, _ = _encoder(dictionary, simulation)
-    return counts, int(dictionary.number(0x6076, absent=0).value)
+    counts, gear_ratio = _encoder(dictionary, simulation)
+    limits = [
+        dictionary.number(index, absent=0).value
+        for index in TORQUE_LIMITS
+        if (index, 0) in dictionary
+    ]
+    rated = int(dictionary.number(0x6076, absent=0).value)
+    return ServoScales(counts, gear_ratio, rated, float(min(limits, default=math.inf)))
 
 
 def _dictionary(drive: DriveSettings, simulation: Simulation, node_id: int) -> Dictionary:
     """The drive's dictionary, with what the simulation knows where it is silent."""
     dictionary = Dictionary.load(drive.eds, node_id)
+    for (index, subindex), value in simulation.written.items():
+        dictionary.power_on_with(index, subindex, value)
     dictionary.supply(0x1000, 0, _SERVO_DRIVE)
     dictionary.supply(0x6076, 0, round(1000.0 * simulation.rated_torque_nm))
     dictionary.supply(0x608F, 1, simulation.counts_per_rev)

@@ -1,6 +1,17 @@
-"""How stiff a wall can be: strikes on the simulated drive, judged, and the largest K found."""
+"""How stiff a wall can be: strikes in memory or through frames, judged, over any axes."""
 
-from canwall.sweep.limit import Limit, k_limit
-from canwall.sweep.strike import OPERATORS, Operator, Verdict, strike_over_bus
+from canwall.sweep.dataset import gathered
+from canwall.sweep.plan import Plan, make_plan
+from canwall.sweep.strike import OPERATORS, Operator, Strike
+from canwall.sweep.sweeping import read_sweep, sweep
 
-__all__ = ["OPERATORS", "Limit", "Operator", "Verdict", "k_limit", "strike_over_bus"]
+__all__ = [
+    "OPERATORS",
+    "Operator",
+    "Plan",
+    "Strike",
+    "gathered",
+    "make_plan",
+    "read_sweep",
+    "sweep",
+]

@@ -1,10 +1,10 @@
 """The closed loop in memory: the same compiled cycle and the same servo, without a bus between.
 
 What the bus does to the loop is kept to the bit: positions in counts, torques in per mille, and
-the delay D from a sample to its torque. What it is not: frames, the drive's state machine, what
-the drive itself holds the torque to (I²t, its own limits).
+the delay D from a sample to its torque. What it is not: frames, the drive's state machine, I²t.
 """
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -17,7 +17,14 @@ from canwall.cycle import Trip, fade_in, make_cycle, run_laws, start_at, step
 from canwall.drive import DriveSetup, Field, PdoLayout, State
 from canwall.drive import objects as od
 from canwall.record import ROW, Phase
-from canwall.simdrive import encoder_counts, hand_force, make_servo, move_servo, servo_scales
+from canwall.simdrive import (
+    ServoScales,
+    encoder_counts,
+    hand_force,
+    make_servo,
+    move_servo,
+    servo_scales,
+)
 from canwall.units import DriveUnits
 from canwall.walls import MAX_DELAY
 
@@ -51,6 +58,20 @@ class Simulated:
     trip: Trip
 
 
+@dataclass(frozen=True)
+class Signals:
+    """One run while it rendered: each (n,), up to a trip if there is one (0: none).
+
+    y: position relative to the wall. force: held from each SYNC on, out of the wall. torque: what
+    was commanded in each cycle [N·m].
+    """
+
+    y: Array
+    force: Array
+    torque: Array
+    trip: int
+
+
 def simulate(settings: Settings, cycles: int, enabling: int = ENABLING_CYCLES) -> Simulated:
     """Render the wall of a configuration for `cycles` SYNCs, the first `enabling` without torque.
 
@@ -58,42 +79,132 @@ def simulate(settings: Settings, cycles: int, enabling: int = ENABLING_CYCLES) -
     "immediate"), and `simulation.torque_delay_cycles` beyond. Raises ConfigError for what only a
     run has: changes of the wall, a person at the handle.
     """
-    simulation = settings.simulation
-    if simulation is None:
-        raise ConfigError("[simulation] is missing: there is no drive to simulate")
-    if settings.schedule or settings.wall.alternate:
-        raise ConfigError("schedule, wall.alternate: only a run changes its wall")
-    laws = run_laws(settings)
-    counts_per_rev, rated_mnm = servo_scales(settings.drive, simulation)
-    units = DriveUnits(counts_per_rev, rated_mnm / 1000.0)
-    cycle = make_cycle(settings, DriveSetup(units, 0, _TPDO, _RPDO), laws)
-    servo = make_servo(simulation, counts_per_rev)
-    start_at(cycle, encoder_counts(servo))
-    cycle["phase"] = Phase.ENABLING
-    fade_in(cycle, round(settings.run.ramp_in_s / settings.bus.cycle_s))
-    delay = simulation.torque_delay_cycles
-    delay += 0.0 if settings.drive.torque_pdo == "immediate" else 1.0
-    if delay > MAX_DELAY:
-        raise ConfigError(
-            f"simulation.torque_delay_cycles: a delay of {delay:g} cycles in all is more than "
-            f"{MAX_DELAY}, which is what the laws can reckon with"
-        )
-    push, slope = hand_force(simulation.hand, settings.bus.cycle_s, cycles)
+    loop = ClosedLoop(settings, cycles, enabling)
     rows = np.zeros(cycles, ROW)
-    whole = math.floor(delay)
-    done = _close(
-        cycle,
-        servo,
-        push,
-        slope,
-        rated_mnm * _PER_MILLE_MILLI,
-        whole,
-        delay - whole,
-        settings.bus.cycle_s,
-        enabling,
-        rows,
+    cycle, done = loop.close(rows, np.empty((3, cycles)))
+    return Simulated(rows[:done], loop.units, Trip(int(cycle["trip"][0])))
+
+
+class ClosedLoop:
+    """Cycle, servo and hand of a configuration, ready to be closed with one wall or several."""
+
+    def __init__(self, settings: Settings, cycles: int, enabling: int = ENABLING_CYCLES) -> None:
+        """Raise ConfigError as `simulate` does."""
+        simulation = settings.simulation
+        if simulation is None:
+            raise ConfigError("[simulation] is missing: there is no drive to simulate")
+        if settings.schedule or settings.wall.alternate:
+            raise ConfigError("schedule, wall.alternate: only a run changes its wall")
+        scales = known_scales(settings)
+        motor_nm = scales.rated_torque_mnm / 1000.0
+        self.units = DriveUnits.behind_gear(
+            scales.counts_per_rev / scales.gear_ratio, motor_nm, scales.gear_ratio
+        )
+        limit_nm = scales.torque_limit_per_mille * self.units.nm_per_mille
+        setup = DriveSetup(self.units, 0, _TPDO, _RPDO, torque_limit_nm=limit_nm)
+        self._cycle = make_cycle(settings, setup, run_laws(settings))
+        self._servo = make_servo(simulation, scales.counts_per_rev)
+        start_at(self._cycle, encoder_counts(self._servo))
+        self._cycle["phase"] = Phase.ENABLING
+        fade_in(self._cycle, round(settings.run.ramp_in_s / settings.bus.cycle_s))
+        delay = loop_delay(settings)
+        if delay > MAX_DELAY:
+            raise ConfigError(
+                f"simulation.torque_delay_cycles: a delay of {delay:g} cycles in all is more than "
+                f"{MAX_DELAY}, which is what the laws can reckon with"
+            )
+        self._push, self._slope = hand_force(simulation.hand, settings.bus.cycle_s, cycles)
+        self._nm_per_mille = scales.rated_torque_mnm * _PER_MILLE_MILLI * scales.gear_ratio
+        self._whole = math.floor(delay)
+        self._share = delay - self._whole
+        self._period = settings.bus.cycle_s
+        self._enabling = enabling
+
+    def close(
+        self, rows: NDArray[np.void], signals: Array, wall: tuple[float, float] | None = None
+    ) -> tuple[NDArray[np.void], int]:
+        """Run from the beginning: the cycle as it is at the end, and how many cycles there were.
+
+        rows has dtype ROW and as many elements as are to be kept: cycle j goes into j modulo
+        their number. signals has shape (3, cycles): y, force, torque of `Signals`. wall: stiffness
+        and damping other than the configuration's.
+        """
+        cycle = self._cycle.copy()
+        if wall is not None:
+            _make_wall(cycle, *wall)
+        done = _close(
+            cycle,
+            self._servo.copy(),
+            self._push,
+            self._slope,
+            self._nm_per_mille,
+            self._whole,
+            self._share,
+            self._period,
+            self._enabling,
+            rows,
+            signals,
+        )
+        return cycle, done
+
+    def signals(self, stiffness: float, damping: float) -> Signals:
+        """What the configuration's hand does with a wall of that stiffness and damping."""
+        into = np.empty((3, len(self._push)))
+        cycle, done = self.close(np.zeros(1, ROW), into, (stiffness, damping))
+        y, force, torque = into[:, self._enabling : done]
+        return Signals(y, force, torque, int(cycle["trip"][0]))
+
+
+def loop_delay(settings: Settings) -> float:
+    """D of the simulated drive: from a sample to its torque, in cycles (theory, section 3)."""
+    assert settings.simulation is not None
+    synchronous = settings.drive.torque_pdo != "immediate"
+    return settings.simulation.torque_delay_cycles + (1.0 if synchronous else 0.0)
+
+
+def known_scales(settings: Settings) -> ServoScales:
+    """`servo_scales`, each dictionary read once."""
+    drive, simulation = settings.drive, settings.simulation
+    assert simulation is not None
+    # Reading a dictionary costs as much as a hundred strikes: kept by all that it depends on.
+    known = simulation.model_dump(
+        mode="json", include={"objects", "counts_per_rev", "rated_torque_nm"}
     )
-    return Simulated(rows[:done], units, Trip(int(cycle["trip"][0])))
+    try:
+        written = drive.eds.stat().st_mtime_ns
+    except OSError:
+        written = 0
+    return _scales(_Scaled(settings, (str(drive.eds), written, drive.node_id, str(known))))
+
+
+class _Scaled:
+    """Settings that are alike in what the scales depend on."""
+
+    def __init__(self, settings: Settings, key: tuple[object, ...]) -> None:
+        self.settings, self.key = settings, key
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Scaled) and self.key == other.key
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+
+@functools.lru_cache(maxsize=256)
+def _scales(scaled: _Scaled) -> ServoScales:
+    assert scaled.settings.simulation is not None
+    return servo_scales(scaled.settings.drive, scaled.settings.simulation)
+
+
+@compiled
+def _make_wall(cycles: NDArray[np.void], stiffness: float, damping: float) -> None:
+    """Write the wall to be rendered where `set_wall` writes it."""
+    cycle: Record = cycles[0]
+    wall = cycle.rendered[0].wall[0]
+    wall.stiffness = stiffness
+    wall.damping = damping
+    wall.referent[0].wall_stiffness = stiffness
+    wall.referent[0].wall_damping = damping
 
 
 @compiled
@@ -108,19 +219,24 @@ def _close(
     period: float,
     enabling: int,
     rows: NDArray[np.void],
+    signals: Array,
 ) -> int:
-    """Fill the rows; how many there are. The torque of sample j acts from j + whole + share on."""
+    """Fill the signals; how many cycles. The torque of sample j acts from j + whole + share on."""
     cycle: Record = cycles[0]
     counts = encoder_counts(servos)
     # Torques on their way in per mille: sent[k] was computed k samples ago.
     sent = np.zeros(MAX_DELAY + 2, np.int64)
-    for j in range(len(rows)):
+    at = 0
+    for j in range(len(push)):
         if j == enabling:
             cycle.phase = _RENDERING
         # What the drive shows acts at the instant of the SYNC; one that is on its way does not.
         shown = sent[whole] if share > 0.0 or whole == 0 else sent[whole - 1]
         data = (counts & 0xFFFFFFFF) | (_ENABLED << 32) | ((shown & 0xFFFF) << 48)
-        step(cycles, rows[j : j + 1], data, True)
+        step(cycles, rows[at : at + 1], data, True)
+        row: Record = rows[at]
+        signals[0, j], signals[1, j], signals[2, j] = row.y, row.force_applied, row.torque_cmd
+        at = at + 1 if at + 1 < len(rows) else 0
         for k in range(MAX_DELAY + 1, 0, -1):
             sent[k] = sent[k - 1]
         sent[0] = cycle.torque_per_mille
@@ -131,4 +247,4 @@ def _close(
         counts = move_servo(servos, sent[whole] * nm_per_mille, after, slope[j], period - late)
         if cycle.trip != 0:
             return j + 1
-    return len(rows)
+    return len(push)

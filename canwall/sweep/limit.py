@@ -1,99 +1,75 @@
-"""The K-limit: the largest stiffness at which no strike chatters (theory, section 5)."""
+"""The K-limit: the largest stiffness free of chatter (theory, section 5), by bisection in log K."""
 
+import functools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
-from canwall.config import Settings, Wall
-from canwall.sweep.strike import Operator, Verdict, strike_over_bus, strike_settings
+import numpy as np
+from numpy.typing import NDArray
 
-#: Mean approach speeds [rad/s], and shares of a period by which the contact is shifted.
-SPEEDS_RAD_S = (0.5, 1.0, 2.0)
-PHASES = (0.0, 0.35, 0.7)
+from canwall.sweep.measures import MEASURES
+from canwall.sweep.strike import Strike
+
+#: Where the search begins and between what it stays: K·T²/m.
+FIRST, SMALLEST, LARGEST = 1.0 / 512.0, 1e-5, 4.0
+#: Width in log K at which a bracket is narrow enough.
+RESOLUTION = 0.01
+
+#: One strike of a search: its own limit, whether that is but the end of the search, the worst
+#: limit of all strikes [N·m/rad], and what is measured of the strike there (zero stiffness: NaN).
+LIMITED = np.dtype(
+    [("limit", "f8"), ("open_ended", "?"), ("worst", "f8"), *MEASURES.descr], align=True
+)
 
 
-@dataclass(frozen=True)
-class Limit:
-    """K-limit of one law with one operator.
+def k_limits(strikes: Sequence[Strike], damping: float) -> NDArray[np.void]:
+    """Limits of all strikes on a wall of that damping [N·m·s/rad]; shape (n,), dtype LIMITED.
 
-    stiffness [N·m/rad] is the largest K found free of chatter; normalised is K·T²/m with the
-    inertia that really moves. The energies are the worst over all strikes at that K.
+    The worst is free of chatter for every one of them, not only the least of their limits.
     """
-
-    stiffness: float
-    normalised: float
-    energy_out_max: float
-    energy_in_tolerances: float
-    peak_torque: float
-    beyond: str
-
-
-def worst_strike(
-    base: Settings,
-    operator: Operator,
-    wall: Wall,
-    speeds: Sequence[float] = SPEEDS_RAD_S,
-    phases: Sequence[float] = PHASES,
-    known_inertia: float = 1.0,
-    strike: Callable[[Settings], Verdict] = strike_over_bus,
-) -> list[Verdict]:
-    """Verdicts over all approach speeds and phases, up to the first that chatters."""
-    verdicts = []
-    for speed in speeds:
-        for phase in phases:
-            settings = strike_settings(base, operator, wall, speed, phase, known_inertia)
-            verdicts.append(strike(settings))
-            if verdicts[-1].chatters:
-                return verdicts
-    return verdicts
+    found = np.zeros(len(strikes), LIMITED)
+    unit = strikes[0].mass / strikes[0].period ** 2
+    for i, strike in enumerate(strikes):
+        free, taken = bracket(functools.partial(_is_free, strike, unit, damping))
+        found["limit"][i], found["open_ended"][i] = free * unit, math.isinf(taken)
+    worst = found["limit"].min()
+    while worst > 0.0:
+        measured = [strike.on(worst, damping) for strike in strikes]
+        if not any(m["chatters"] for m in measured):
+            for name in MEASURES.names or ():
+                found[name] = [m[name] for m in measured]
+            break
+        # Free at its own limit, a strike may chatter below it.
+        worst *= math.exp(-RESOLUTION)
+        if worst < SMALLEST * unit:
+            worst = 0.0
+    if worst == 0.0:
+        for name in MEASURES.names or ():
+            found[name] = math.nan if MEASURES[name].kind == "f" else 0
+    found["worst"] = worst
+    return found
 
 
-def k_limit(
-    base: Settings,
-    operator: Operator,
-    wall: Wall,
-    largest_normalised: float = 4.0,
-    resolution: float = 0.03,
-    known_inertia: float = 1.0,
-) -> Limit:
-    """Bisect log K between a wall free of chatter and one that is not.
+def _is_free(strike: Strike, unit: float, damping: float, normalised: float) -> bool:
+    return not strike.on(normalised * unit, damping)["chatters"]
 
-    K goes up by factors of two from K·T²/m = 1/512 until a strike chatters (down, where the first
-    does already), then the bracket is halved until it is narrower than `resolution`. The search
-    ends at `largest_normalised`. wall gives everything but the stiffness.
+
+def bracket(is_free: Callable[[float], bool]) -> tuple[float, float]:
+    """(the largest that is free, one that is not) no further apart than RESOLUTION in the log.
+
+    Goes up by factors of two from FIRST until one is not free, down where the first is not.
+    (0, …) where none is free down to SMALLEST, (…, inf) where all are up to LARGEST.
     """
-    assert base.simulation is not None
-    mass = base.simulation.inertia_kg_m2 + operator.inertia_kg_m2
-    unit = mass / base.bus.cycle_s**2
-
-    def verdicts(normalised: float) -> list[Verdict]:
-        stiff = wall.model_copy(update={"stiffness_nm_per_rad": normalised * unit})
-        return worst_strike(base, operator, stiff, known_inertia=known_inertia)
-
-    free, chattering = 0.0, math.inf
-    at_free: list[Verdict] = []
-    reason = f"none up to K·T²/m = {largest_normalised:g}"
-    normalised = 1.0 / 512.0
-    while normalised <= largest_normalised and normalised > 1e-5:
-        found = verdicts(normalised)
-        if found[-1].chatters:
-            chattering, reason = normalised, found[-1].reason
+    free, taken, at = 0.0, math.inf, FIRST
+    while SMALLEST <= at <= LARGEST:
+        if is_free(at):
+            free = at
         else:
-            free, at_free = normalised, found
-        if free and chattering < math.inf:
-            if math.log(chattering / free) < resolution:
+            taken = at
+        if free > 0.0 and taken < math.inf:
+            if math.log(taken / free) < RESOLUTION:
                 break
-            normalised = math.sqrt(free * chattering)
+            at = math.sqrt(free * taken)
         else:
-            normalised *= 0.5 if found[-1].chatters else 2.0
-    return Limit(
-        stiffness=free * unit,
-        normalised=free,
-        energy_out_max=max((v.energy_out_max for v in at_free), default=0.0),
-        energy_in_tolerances=max(
-            (v.energy_out_max / v.energy_tolerance for v in at_free if v.energy_tolerance > 0.0),
-            default=0.0,
-        ),
-        peak_torque=max((v.peak_torque for v in at_free), default=0.0),
-        beyond=reason,
-    )
+            at *= 2.0 if free > 0.0 else 0.5
+    return free, taken

@@ -1,35 +1,37 @@
-"""One strike on the simulated drive, through the bus, and what came of it."""
+"""One strike of an operator on a wall: as settings of a run, rendered, and measured."""
 
+import threading
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from canwall import metrics
-from canwall.config import Hand, Mechanics, Settings, Simulation, Wall
+from canwall.config import Hand, Mechanics, Settings
 from canwall.cycle import run_laws
-from canwall.record import Ring
-from canwall.referent import referent_positions
-from canwall.run import (
-    drive_dictionary,
-    make_axis,
-    make_exchange,
-    on_the_bus,
-    render,
-)
-from canwall.units import DriveUnits
+from canwall.record import Phase, Ring
+from canwall.referent import Referent
+from canwall.run import drive_dictionary, make_axis, make_exchange, on_the_bus, render
+from canwall.sweep.closed_loop import ENABLING_CYCLES, ClosedLoop, Signals
+from canwall.sweep.measures import MEASURES, measure
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Operator:
-    """Who is at the handle: impedance in shaft coordinates, and how he presses."""
+    """Who is at the handle: impedance in shaft coordinates."""
 
     name: str
     inertia_kg_m2: float
     damping_nm_s_per_rad: float
     stiffness_nm_per_rad: float
+
+    @property
+    def keys(self) -> dict[str, float]:
+        """As keys of a configuration."""
+        return {
+            f"simulation.hand.{key}": value for key, value in vars(self).items() if key != "name"
+        }
 
 
 _RADIUS_M = 0.08
@@ -49,87 +51,144 @@ OPERATORS = {
         Operator("none", 0.0, 0.0, 0.0),
         _at_radius("finger", 0.010, 4.0, 500.0),
         _at_radius("grip", 0.050, 8.0, 1200.0),
-        _at_radius("arm", 0.55, 6.5, 135.0),
+        _at_radius("hand", 0.55, 6.5, 135.0),
     )
 }
 
 _PRESSING_NM = 0.15
 _FIRST_STRIKE_S = 0.05
 _START_RAD = 0.03
-_PRESS_S = 0.6
 _AFTERWARDS_S = 0.25
+#: Cycles of rest between enabling and the strike: at 100 Hz the above is no time for it.
+_AT_REST_CYCLES = 3
 
 
-def strike_settings(
-    base: Settings,
-    operator: Operator,
-    wall: Wall,
-    speed_rad_s: float,
-    phase: float,
-    known_inertia: float = 1.0,
-) -> Settings:
-    """One strike of an operator, pressing with 0.15 N·m, on a wall, as settings of a run.
+def model_of(settings: Settings, knows: str, error: float) -> Mechanics:
+    """The laws' model: "matched" knows drive and hand, "drive" the drive alone, "file" [mechanics].
+
+    error is the relative error of its inertia. The hand's spring is not in it: it is about a hand
+    that moves, and left to the estimated force.
+    """
+    simulation = settings.simulation
+    assert simulation is not None
+    if knows == "file":
+        model = settings.mechanics
+    else:
+        hand = (
+            simulation.hand
+            if knows == "matched"
+            else Hand(inertia_kg_m2=0.0, damping_nm_s_per_rad=0.0)
+        )
+        model = Mechanics(
+            inertia_kg_m2=simulation.inertia_kg_m2 + hand.inertia_kg_m2,
+            viscous_nm_s_per_rad=simulation.viscous_nm_s_per_rad + hand.damping_nm_s_per_rad,
+            coulomb_nm=simulation.coulomb_nm,
+        )
+    return model.model_copy(update={"inertia_kg_m2": model.inertia_kg_m2 * (1.0 + error)})
+
+
+def struck(settings: Settings, speed_rad_s: float, phase: float, press_s: float) -> Settings:
+    """The configuration's operator strikes the wall once, pressing with 0.15 N·m for press_s.
 
     speed_rad_s is the mean speed of the hand's approach; phase, 0 … 1, shifts the start by that
     share of the way of one period, and with it the instant of contact against the SYNC.
-    The model of the laws has drive and hand but for the hand's spring: about a hand that moves, it
-    is for the estimated force. known_inertia is the share of the inertia that the model knows.
-    The servo is an ideal one: what is judged is the law.
     """
-    simulation = (base.simulation or Simulation()).with_ideal_servo()
-    start = _START_RAD + phase * speed_rad_s * base.bus.cycle_s
-    stiffness = operator.stiffness_nm_per_rad
+    simulation, period = settings.simulation, settings.bus.cycle_s
+    assert simulation is not None
+    sign = 1.0 if settings.wall.side == "below" else -1.0
+    wall = settings.wall.position_rad
+    start = _START_RAD + phase * speed_rad_s * period
+    stiffness = simulation.hand.stiffness_nm_per_rad
     # A hand with a spring presses by it; without one, by its muscle torque alone.
     depth = _PRESSING_NM / stiffness if stiffness > 0.0 else 0.0
     travel_s = (start + depth) / speed_rad_s
-    hand = Hand(
-        inertia_kg_m2=operator.inertia_kg_m2,
-        damping_nm_s_per_rad=operator.damping_nm_s_per_rad,
-        stiffness_nm_per_rad=stiffness,
-        strikes=1,
-        first_strike_s=_FIRST_STRIKE_S,
-        rest_rad=start,
-        press_rad=-depth,
-        press_torque_nm=0.0 if stiffness > 0.0 else -_PRESSING_NM,
-        approach_s=travel_s,
-        press_s=_PRESS_S,
-        withdraw_s=travel_s,
-    )
-    moving = simulation.model_copy(update={"hand": hand})
-    mechanics = Mechanics(
-        inertia_kg_m2=(simulation.inertia_kg_m2 + operator.inertia_kg_m2) * known_inertia,
-        viscous_nm_s_per_rad=simulation.viscous_nm_s_per_rad + operator.damping_nm_s_per_rad,
-        coulomb_nm=simulation.coulomb_nm,
-    )
-    duration = _FIRST_STRIKE_S + 2.0 * travel_s + _PRESS_S + _AFTERWARDS_S
-    return base.model_copy(
+    first_s = max(_FIRST_STRIKE_S, (ENABLING_CYCLES + _AT_REST_CYCLES) * period)
+    hand = simulation.hand.model_copy(
         update={
-            "simulation": moving,
-            "mechanics": mechanics,
-            "wall": wall,
+            "strikes": 1,
+            "first_strike_s": first_s,
+            "rest_rad": wall + sign * start,
+            "press_rad": wall - sign * depth,
+            "press_torque_nm": 0.0 if stiffness > 0.0 else -sign * _PRESSING_NM,
+            "approach_s": travel_s,
+            "press_s": press_s,
+            "withdraw_s": travel_s,
+            "script": (),
+            "random": None,
+        }
+    )
+    duration = first_s + 2.0 * travel_s + press_s + _AFTERWARDS_S
+    return settings.model_copy(
+        update={
+            "simulation": simulation.model_copy(update={"hand": hand}),
             "schedule": (),
-            "run": base.run.model_copy(update={"duration_s": duration}),
+            "run": settings.run.model_copy(update={"duration_s": duration}),
         }
     )
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """What came of one strike. Energies [J], torque [N·m]."""
+class Strike:
+    """One strike, prepared, to be rendered against one wall after another, and measured."""
 
-    chatters: bool
-    reason: str
-    energy_out_max: float
-    energy_tolerance: float
-    peak_torque: float
-    trips: tuple[str, ...]
+    def __init__(self, settings: Settings, through: str = "sim") -> None:
+        """settings: as `struck` gives them. through: "sim", in memory, or "bus", by frames."""
+        assert settings.run.duration_s is not None
+        assert settings.simulation is not None
+        self._settings = settings
+        self._cycles = round(settings.run.duration_s / settings.bus.cycle_s)
+        self._loop = ClosedLoop(settings, self._cycles)
+        self._referent = Referent(settings, settings.simulation, self._cycles)
+        self._origin = np.full(self._cycles, settings.wall.position_rad)
+        self._by_frames = through == "bus"
+
+    @property
+    def mass(self) -> float:
+        """Inertia of what really moves [kg·m²]."""
+        assert self._settings.simulation is not None
+        simulation = self._settings.simulation
+        return simulation.inertia_kg_m2 + simulation.hand.inertia_kg_m2
+
+    @property
+    def period(self) -> float:
+        """T [s]."""
+        return self._settings.bus.cycle_s
+
+    def on(self, stiffness: float, damping: float) -> np.void:
+        """The strike on a wall of that stiffness [N·m/rad] and damping [N·m·s/rad]; MEASURES."""
+        if self._by_frames:
+            wall = {"stiffness_nm_per_rad": stiffness, "damping_nm_s_per_rad": damping}
+            signals = signals_over_bus(
+                self._settings.model_copy(
+                    update={"wall": self._settings.wall.model_copy(update=wall)}
+                )
+            )
+        else:
+            signals = self._loop.signals(stiffness, damping)
+        referent = self._referent.positions(
+            np.full(self._cycles, stiffness), np.full(self._cycles, damping), self._origin
+        )[ENABLING_CYCLES:]
+        found = np.zeros(1, MEASURES)
+        measure(
+            signals.y,
+            signals.force,
+            signals.torque,
+            signals.trip,
+            referent[: len(signals.y)],
+            self.period,
+            self._loop.units.rad_per_count,
+            self._loop.units.nm_per_mille,
+            stiffness,
+            found,
+        )
+        return found[0]
 
 
-def strike_over_bus(settings: Settings) -> Verdict:
-    """Render the wall for one strike, through frames on the embedded bus, and judge it.
-
-    A run that trips (speed, position) counts as chatter: its wall threw the handle away.
-    """
+def signals_over_bus(settings: Settings) -> Signals:
+    """Render the wall of a strike through frames, on an embedded bus of its own."""
+    # A bus of its own: other threads of the process may strike at the same time.
+    channel = f"{settings.bus.channel}-{threading.get_ident()}"
+    bus = settings.bus.model_copy(update={"interface": "virtual", "channel": channel})
+    settings = settings.model_copy(update={"bus": bus})
     laws = run_laws(settings)
     ring = Ring.create()
     pieces: list[NDArray[np.void]] = []
@@ -141,31 +200,13 @@ def strike_over_bus(settings: Settings) -> Verdict:
     try:
         with on_the_bus(settings) as link:
             axis = make_axis(link, settings, drive_dictionary(settings), laws, ring)
-            outcome = render(make_exchange(link, [axis]), lambda: False, collect)
+            render(make_exchange(link, [axis]), lambda: False, collect)
         collect(0.0)
     finally:
         ring.close()
-    return judge(np.concatenate(pieces), settings, axis.setup.units, tuple(outcome.trips))
-
-
-def judge(
-    rows: NDArray[np.void], settings: Settings, units: DriveUnits, trips: tuple[str, ...]
-) -> Verdict:
-    """Chatter and energy out over the whole of a strike; rows has dtype record.ROW."""
-    y, force = rows["y"], rows["force_applied"]
-    referent = referent_positions(
-        settings, rows["stiffness"], rows["damping"], rows["wall_position_rad"]
+    rows = np.concatenate(pieces)
+    rows = rows[rows["phase"] == Phase.RENDERING]
+    y, force, torque = (
+        np.ascontiguousarray(rows[name]) for name in ("y", "force_applied", "torque_cmd")
     )
-    peak = float(np.abs(rows["torque_cmd"]).max(initial=0.0))
-    tolerance = metrics.amplitude_tolerance(
-        settings.wall.stiffness_nm_per_rad, units.rad_per_count, units.nm_per_mille
-    )
-    verdict = metrics.chatter(y, referent, settings.bus.cycle_s, tolerance, units.rad_per_count)
-    return Verdict(
-        chatters=verdict.chatters or bool(trips),
-        reason="; ".join(trips) or verdict.reason,
-        energy_out_max=float(metrics.energy_out(y, force).max(initial=0.0)),
-        energy_tolerance=units.rad_per_count * peak,
-        peak_torque=peak,
-        trips=trips,
-    )
+    return Signals(y, force, torque, int(axis.cycle["trip"][0]))

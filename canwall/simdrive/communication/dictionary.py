@@ -269,6 +269,21 @@ class Dictionary:
             except OverflowError as error:
                 raise self.error(index, subindex, f"cannot hold {value}") from error
 
+    def power_on_with(self, index: int, subindex: int, value: int) -> None:
+        """Give an entry another power-on value than the EDS does.
+
+        Raises:
+            DictionaryError: the EDS does not list it, or with a type that does not hold the value.
+        """
+        if (index, subindex) not in self:
+            raise self.error(index, subindex, "is not there; simulation.objects cannot set it")
+        entry = self.number(index, subindex, absent=value)
+        if entry.codec is None or entry.codec.unpack(
+            (value & (1 << 8 * entry.codec.size) - 1).to_bytes(entry.codec.size, "little")
+        ) != (value,):
+            raise self.error(index, subindex, f"cannot hold {value}")
+        entry.default = entry.value = value
+
     def number(self, index: int, subindex: int = 0, *, absent: int) -> Entry:
         """Return an integer entry that a service works with.
 

@@ -1,0 +1,254 @@
+"""The axes of a sweep: names, units, and what a value on one of them does to a configuration."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from canwall.config import ConfigError, Settings, absolute_law, overridden
+from canwall.errors import InputError
+from canwall.simdrive import TORQUE_LIMITS
+from canwall.sweep.closed_loop import known_scales, loop_delay
+from canwall.sweep.strike import OPERATORS, model_of, struck
+from canwall.walls import DEADBEAT, MAX_DELAY
+
+Value = str | int | float | bool
+Point = Mapping[str, Value]
+
+#: Axes that are no key of the configuration: (unit, what it is).
+NAMED = {
+    "law": ("", "law of the wall, with +deadbeat where it is compensated"),
+    "stiffness": ("N*m/rad", "K"),
+    "stiffness_normalised": ("1", "K*T^2/m, m what really moves"),
+    "damping": ("N*m*s/rad", "B"),
+    "damping_normalised": ("1", "B*T/m, m what really moves"),
+    "rate": ("Hz", "rate of the SYNC"),
+    "delay": ("1", "D, cycles from a sample to its torque"),
+    "counts": ("1", "encoder increments per turn, 0x608F"),
+    "torque_step": ("N*m", "a thousandth of the rated torque, 0x6076"),
+    "operator": ("", "who is at the handle"),
+    "model": ("", "what the laws' model knows: matched, drive, file"),
+    "model_error": ("1", "relative error of the model's inertia"),
+    "servo": ("", "file: as configured; ideal: no cogging, any torque, at once"),
+    "speed": ("rad/s", "mean speed of the hand's approach"),
+    "phase": ("1", "phase of the contact against the SYNC"),
+    "press": ("s", "how long the hand presses"),
+}
+#: Axes of the wall itself: a strike prepared once meets all of their values.
+STIFFNESS = ("stiffness", "stiffness_normalised")
+DAMPING = ("damping", "damping_normalised")
+#: Axes over which the worst counts.
+STRIKES = ("speed", "phase")
+#: What holds where neither the configuration nor the command line says otherwise.
+DEFAULTS: dict[str, tuple[Value, ...]] = {
+    "model": ("matched",),
+    "model_error": (0.0,),
+    "servo": ("file",),
+    "press": (0.6,),
+    "speed": (0.5, 1.0, 2.0),
+    "phase": (0.0, 0.35, 0.7),
+}
+_CHOICES = {
+    "model": ("matched", "drive", "file"),
+    "servo": ("file", "ideal"),
+    "operator": tuple(OPERATORS),
+}
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One axis: its name and its values, in order."""
+
+    name: str
+    values: tuple[Value, ...]
+
+    @property
+    def unit(self) -> str:
+        """Unit of the values; empty for names."""
+        return NAMED.get(self.name, ("", ""))[0]
+
+
+def parsed(name: str, given: object) -> Axis:
+    """An axis from an array, one value, "A,B,C" or "LO:HI:N"; N steps, geometric for stiffness.
+
+    "LO:HI:N:log" and "LO:HI:N:lin" say which. Raises InputError.
+    """
+    if isinstance(given, str):
+        values = tuple(v for part in given.split(",") for v in _written(name, part.strip()))
+    elif isinstance(given, Sequence):
+        values = tuple(v for part in given for v in parsed(name, part).values)
+    else:
+        values = (given,)  # type: ignore[assignment]
+    if not values or "" in values:
+        raise InputError(f"sweep axis {name}: has no values")
+    if len(set(values)) < len(values):
+        raise InputError(f"sweep axis {name}: a value is there twice")
+    for value in values:
+        _check(name, value)
+    return Axis(name, values)
+
+
+def _written(name: str, text: str) -> list[Value]:
+    parts = text.split(":")
+    numbers = [_number(part) for part in parts[:3]]
+    if len(parts) in (3, 4) and all(isinstance(n, int | float) for n in numbers):
+        low, high, count = numbers
+        kind = parts[3] if len(parts) == 4 else ("log" if name in STIFFNESS else "lin")
+        if not isinstance(count, int) or count < 1 or kind not in ("log", "lin"):
+            raise InputError(f"sweep axis {name}: {text!r} is no range; write LO:HI:N")
+        if kind == "log" and not (low > 0 and high > 0):  # type: ignore[operator]
+            raise InputError(f"sweep axis {name}: {text!r}: a geometric range has to be above 0")
+        spaced = np.geomspace if kind == "log" else np.linspace
+        found = spaced(float(low), float(high), count)
+        whole = all(isinstance(n, int) for n in numbers) and np.all(found == np.rint(found))
+        return [int(v) if whole else float(v) for v in found]
+    return [_number(text)]
+
+
+def _number(text: str) -> Value:
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return {"true": True, "false": False}.get(text, text)
+
+
+def _check(name: str, value: Value) -> None:
+    """Raise InputError for a value that the axis cannot have, whatever the configuration."""
+    if name in _CHOICES:
+        if value not in _CHOICES[name]:
+            raise InputError(
+                f"sweep axis {name}: no {value!r}; there are {', '.join(_CHOICES[name])}"
+            )
+        return
+    if name not in NAMED or name == "law":
+        return
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not number or not math.isfinite(value):  # type: ignore[arg-type]
+        raise InputError(f"sweep axis {name}: has to be a number, not {value!r}")
+    low = {"model_error": -1.0}.get(name, 0.0)
+    may_be_low = name in ("damping", "damping_normalised", "delay", "phase")
+    if not (value > low or (may_be_low and value == low)):  # type: ignore[operator]
+        raise InputError(f"sweep axis {name}: has to be greater than {low:g}, not {value!r}")
+    if name == "delay" and value > MAX_DELAY:  # type: ignore[operator]
+        raise InputError(f"sweep axis delay: has to be {MAX_DELAY} at most, not {value!r}")
+    if name == "counts" and value != int(value):
+        raise InputError(f"sweep axis counts: has to be a whole number, not {value!r}")
+
+
+def resolve(base: Settings, point: Point) -> Settings:
+    """The settings of one strike: those of the configuration, and what the point says.
+
+    The wall's stiffness and damping are not looked at. Raises ConfigError.
+    """
+    values = {**{name: given[0] for name, given in DEFAULTS.items()}, **point}
+    settings = base.model_copy(update={"schedule": (), "sweep": {}})
+    if settings.simulation is None:
+        raise ConfigError("[simulation] is missing: there is no drive to simulate")
+    for name, change in _CHANGES.items():
+        if name in values:
+            settings = change(settings, values[name])
+    keys = {k: v for k, v in values.items() if k not in NAMED}
+    settings = _overridden(settings, {k: v for k, v in keys.items() if not _of_the_model(k)})
+    assert settings.simulation is not None
+    if values["servo"] == "ideal":
+        ideal = settings.simulation.with_ideal_servo()
+        settings = settings.model_copy(update={"simulation": ideal})
+    model = model_of(settings, str(values["model"]), float(values["model_error"]))
+    settings = settings.model_copy(update={"mechanics": model})
+    settings = _overridden(settings, {k: v for k, v in keys.items() if _of_the_model(k)})
+    if settings.estimator.delay_cycles is None:
+        known = {"delay_cycles": loop_delay(settings), "measure_delay": False}
+        settings = settings.model_copy(
+            update={"estimator": settings.estimator.model_copy(update=known)}
+        )
+    return struck(settings, float(values["speed"]), float(values["phase"]), float(values["press"]))
+
+
+def _of_the_model(key: str) -> bool:
+    return key.startswith("mechanics.")
+
+
+def _overridden(settings: Settings, keys: Mapping[str, Any]) -> Settings:
+    if not keys:
+        return settings
+    try:
+        return overridden(settings, keys)
+    except ConfigError as error:
+        raise ConfigError(f"sweep axis {error}") from None
+
+
+def _with_law(settings: Settings, law: Value) -> Settings:
+    name = absolute_law(str(law), Path())
+    deadbeat = name.endswith(DEADBEAT)
+    wall: dict[str, Any] = {"law": name.removesuffix(DEADBEAT), "deadbeat": deadbeat}
+    if name != named_law(settings):
+        wall["options"] = {}  # they were the other law's
+    return settings.model_copy(update={"wall": settings.wall.model_copy(update=wall)})
+
+
+def named_law(settings: Settings) -> str:
+    """The configuration's law as a value of the axis."""
+    return settings.wall.law + (DEADBEAT if settings.wall.deadbeat else "")
+
+
+def _with_rate(settings: Settings, rate: Value) -> Settings:
+    return _overridden(settings, {"bus.cycle_s": 1.0 / float(rate)})
+
+
+def _with_delay(settings: Settings, delay: Value) -> Settings:
+    """D ≥ 1 on a synchronous RPDO, less on one that acts on reception; the laws know it."""
+    synchronous = float(delay) >= 1.0
+    return _overridden(
+        settings,
+        {
+            "drive.torque_pdo": "sync" if synchronous else "immediate",
+            "simulation.torque_delay_cycles": float(delay) - (1.0 if synchronous else 0.0),
+            "estimator.delay_cycles": float(delay),
+            "estimator.measure_delay": False,
+        },
+    )
+
+
+def _with_objects(settings: Settings, objects: Mapping[str, int], **more: Any) -> Settings:
+    assert settings.simulation is not None
+    update = {"objects": {**settings.simulation.objects, **objects}, **more}
+    return settings.model_copy(update={"simulation": settings.simulation.model_copy(update=update)})
+
+
+def _with_counts(settings: Settings, counts: Value) -> Settings:
+    return _with_objects(settings, {"0x608F:01": int(counts), "0x608F:02": 1})
+
+
+def _with_torque_step(settings: Settings, step: Value) -> Settings:
+    """Another rated torque, and the limits in per mille of it as they were in N·m."""
+    assert settings.simulation is not None
+    scales = known_scales(settings)
+    rated = round(1e6 * float(step))
+    if rated < 1 or abs(rated * 1e-6 - float(step)) > 1e-12:
+        raise ConfigError(
+            f"sweep axis torque_step: {step} N·m: 0x6076 is in mN·m, a step in whole µN·m"
+        )
+    per_mille = min(round(scales.torque_limit_per_mille * scales.rated_torque_mnm / rated), 32767)
+    peak = settings.simulation.peak_torque_nm or 3e-3 * scales.rated_torque_mnm
+    objects = {"0x6076": rated} | {f"0x{index:04X}": per_mille for index in TORQUE_LIMITS}
+    return _with_objects(settings, objects, peak_torque_nm=peak)
+
+
+def _with_operator(settings: Settings, name: Value) -> Settings:
+    return overridden(settings, OPERATORS[str(name)].keys)
+
+
+#: In the order in which they are made: a key of the configuration goes before all of them.
+_CHANGES: dict[str, Callable[[Settings, Value], Settings]] = {
+    "law": _with_law,
+    "rate": _with_rate,
+    "delay": _with_delay,
+    "counts": _with_counts,
+    "torque_step": _with_torque_step,
+    "operator": _with_operator,
+}

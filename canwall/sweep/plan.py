@@ -1,0 +1,181 @@
+"""What a sweep is to do, cut into pieces of work that depend on nothing but their number."""
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canwall.config import Settings
+from canwall.errors import InputError
+from canwall.sweep.axes import (
+    DAMPING,
+    DEFAULTS,
+    STIFFNESS,
+    STRIKES,
+    Axis,
+    Value,
+    named_law,
+    parsed,
+    resolve,
+)
+from canwall.sweep.limit import LIMITED, k_limits
+from canwall.sweep.measures import MEASURES
+from canwall.sweep.strike import Strike
+
+#: Points of a map that are one piece of work: its strike is prepared once.
+_PIECE = 120
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A sweep: the configuration, its axes, and whether frames carry it ("bus") or not ("sim").
+
+    conditions: all axes but the others here. Without a stiffness axis the K-limits are searched.
+    """
+
+    base: Settings
+    conditions: tuple[Axis, ...]
+    stiffness: Axis | None
+    damping: Axis
+    speed: Axis
+    phase: Axis
+    through: str = "sim"
+
+    @property
+    def axes(self) -> list[Axis]:
+        """All of them, in the order of the result's dimensions."""
+        wall = [self.damping] if self.stiffness is None else [self.damping, self.stiffness]
+        return [*self.conditions, *wall, self.speed, self.phase]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """How many values each axis has."""
+        return tuple(len(axis.values) for axis in self.axes)
+
+    @property
+    def points_in_all(self) -> int:
+        """Of the result: strikes, each with its wall."""
+        return math.prod(self.shape)
+
+    @property
+    def dtype(self) -> np.dtype[np.void]:
+        """Of the result: MEASURES of a map, LIMITED of a search."""
+        return MEASURES if self.stiffness is not None else LIMITED
+
+    @cached_property
+    def points(self) -> list[dict[str, Value]]:
+        """The conditions, in order."""
+        names = [axis.name for axis in self.conditions]
+        values = (axis.values for axis in self.conditions)
+        return [dict(zip(names, chosen, strict=True)) for chosen in itertools.product(*values)]
+
+    @property
+    def strikes(self) -> list[dict[str, Value]]:
+        """Approach speeds and phases, in order."""
+        chosen = itertools.product(self.speed.values, self.phase.values)
+        return [{"speed": speed, "phase": phase} for speed, phase in chosen]
+
+    @property
+    def walls(self) -> list[tuple[Value, Value]]:
+        """Damping and stiffness of a map's points, in order."""
+        assert self.stiffness is not None
+        return list(itertools.product(self.damping.values, self.stiffness.values))
+
+    @property
+    def _per_strike(self) -> int:
+        return math.ceil(len(self.walls) / _PIECE)
+
+    @property
+    def pieces(self) -> int:
+        """How many pieces of work there are."""
+        if self.stiffness is None:
+            return len(self.points) * len(self.damping.values)
+        return len(self.points) * len(self.strikes) * self._per_strike
+
+    def where(self, piece: int) -> tuple[int, slice, slice]:
+        """What a piece computes: condition, strikes, walls (dampings in a search)."""
+        if self.stiffness is None:
+            condition, damping = divmod(piece, len(self.damping.values))
+            return condition, slice(0, len(self.strikes)), slice(damping, damping + 1)
+        rest, part = divmod(piece, self._per_strike)
+        condition, strike = divmod(rest, len(self.strikes))
+        walls = slice(part * _PIECE, min((part + 1) * _PIECE, len(self.walls)))
+        return condition, slice(strike, strike + 1), walls
+
+    def settings(self, point: Mapping[str, Value], strike: Mapping[str, Value]) -> Settings:
+        """Those of one strike. Raises ConfigError."""
+        return resolve(self.base, {**point, **strike})
+
+
+def make_plan(base: Settings, given: Mapping[str, object], through: str = "sim") -> Plan:
+    """A plan from the axes of a configuration and those `given`, which go first.
+
+    Raises InputError and ConfigError for an axis that is not there, or has a value that cannot be.
+    """
+    if base.simulation is None:
+        raise InputError("[simulation] is missing: there is no drive to simulate")
+    if through not in ("sim", "bus"):
+        raise InputError(f"--through {through}: has to be sim or bus")
+    axes = {name: parsed(name, v) for name, v in {**base.sweep, **given}.items()}
+    # One of the two ways to say a stiffness or a damping; what is given goes before the file.
+    for pair in (STIFFNESS, DAMPING):
+        both = [name for name in pair if name in axes]
+        if len(both) == 2 and all(name in given for name in both):
+            raise InputError(f"sweep axes {both[0]} and {both[1]}: keep one of them")
+        if len(both) == 2:
+            axes = {n: a for n, a in axes.items() if n not in both or n in given}
+    for key in ("wall.stiffness_nm_per_rad", "wall.damping_nm_s_per_rad", "wall.law"):
+        if key in axes:
+            raise InputError(f"sweep axis {key}: is called {key[5:].split('_')[0]} here")
+    defaults: dict[str, Any] = {"law": (named_law(base),)}
+    defaults |= {name: DEFAULTS[name] for name in STRIKES}
+    if not any(name in axes for name in DAMPING):
+        defaults["damping"] = (base.wall.damping_nm_s_per_rad,)
+    axes = {n: Axis(n, tuple(v)) for n, v in defaults.items() if n not in axes} | axes
+
+    def taken(names: Sequence[str]) -> Axis | None:
+        return next((axes.pop(name) for name in names if name in axes), None)
+
+    stiffness, damping = taken(STIFFNESS), taken(DAMPING)
+    speed, phase = axes.pop("speed"), axes.pop("phase")
+    assert damping is not None
+    law = axes.pop("law")
+    plan = Plan(base, (law, *axes.values()), stiffness, damping, speed, phase, through)
+    _try_out(plan)
+    return plan
+
+
+def _try_out(plan: Plan) -> None:
+    """Prepare a strike for each value of each axis, the others at their first."""
+    first, strike = plan.points[0], plan.strikes[0]
+    Strike(plan.settings(first, strike))
+    for axis in plan.conditions:
+        for value in axis.values[1:]:
+            Strike(plan.settings({**first, axis.name: value}, strike))
+    for other in plan.strikes[1:]:
+        plan.settings(first, other)
+
+
+def compute(plan: Plan, piece: int) -> NDArray[np.void]:
+    """One piece of work; shape (strikes, walls), dtype of the plan."""
+    condition, strikes, walls = plan.where(piece)
+    point = plan.points[condition]
+    prepared = [Strike(plan.settings(point, s), plan.through) for s in plan.strikes[strikes]]
+    mass, period = prepared[0].mass, prepared[0].period
+    damping_unit = mass / period if plan.damping.name == "damping_normalised" else 1.0
+    if plan.stiffness is None:
+        (damping,) = plan.damping.values[walls]
+        return k_limits(prepared, float(damping) * damping_unit)[:, None]
+    stiffness_unit = mass / period**2 if plan.stiffness.name == "stiffness_normalised" else 1.0
+    chosen = plan.walls[walls]
+    found = np.zeros((1, len(chosen)), MEASURES)
+    for i, (damping, stiffness) in enumerate(chosen):
+        found[0, i] = prepared[0].on(
+            float(stiffness) * stiffness_unit, float(damping) * damping_unit
+        )
+    return found

@@ -1,0 +1,78 @@
+"""Who computes the pieces of a sweep: threads, processes, or a Dask cluster."""
+
+import logging
+import multiprocessing
+import os
+import signal
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canwall.errors import InputError, RunFailedError
+from canwall.sweep.plan import Plan, compute
+
+Found = tuple[int, NDArray[np.void]]
+#: How long to wait for a Dask scheduler [s].
+_PATIENCE_S = 10.0
+
+
+def computed(
+    plan: Plan, pieces: Sequence[int], workers: int | None = None, dask: str | None = None
+) -> Iterator[Found]:
+    """The pieces with their numbers, as they are done; ended early, it leaves nothing running.
+
+    workers: how many cores (None: all). dask: address of a scheduler instead. Raises InputError
+    where no scheduler is.
+    """
+    if dask is not None:
+        return _on_a_cluster(plan, pieces, dask)
+    count = workers or len(os.sched_getaffinity(0))
+    if plan.through == "bus":
+        # Frames are the interpreter's work: only other processes have another one.
+        context = multiprocessing.get_context("spawn")
+        return _in_a_pool(plan, pieces, ProcessPoolExecutor(count, context, _leave_signals))
+    return _in_a_pool(plan, pieces, ThreadPoolExecutor(count))
+
+
+def _leave_signals() -> None:
+    """Ctrl-C is for the process that asked for the work."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _in_a_pool(plan: Plan, pieces: Sequence[int], pool: Executor) -> Iterator[Found]:
+    try:
+        jobs = {pool.submit(compute, plan, piece): piece for piece in pieces}
+        for job in as_completed(jobs):
+            yield jobs[job], job.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _on_a_cluster(plan: Plan, pieces: Sequence[int], address: str) -> Iterator[Found]:
+    try:
+        import distributed
+    except ImportError:
+        raise InputError("--dask needs dask.distributed: install canwall[dask]") from None
+    # What it has to say comes as an exception too.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    try:
+        # A client that cannot read its address hangs at the end of the program.
+        distributed.comm.get_address_host_port(address, strict=True)
+        client = distributed.Client(address, timeout=_PATIENCE_S, set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"--dask {address}: no scheduler there: {reason}") from None
+    with client:
+        jobs = {
+            client.submit(compute, plan, piece, pure=False, retries=2): piece for piece in pieces
+        }
+        try:
+            for job in distributed.as_completed(list(jobs)):
+                yield jobs[job], job.result()
+                job.release()
+        except distributed.KilledWorker as error:
+            raise RunFailedError(f"--dask {address}: {error}") from None
+        finally:
+            client.cancel(list(jobs))
