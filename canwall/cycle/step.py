@@ -159,8 +159,11 @@ CYCLE = np.dtype(
         # Whether the estimator knows where the handle is, and how far off it was this time.
         ("started", "?"),
         ("innovation", "f8"),
-        # Cycles since the position last changed, and the motion that was missed in them.
+        # Cycles since the position last changed, its last changes before [counts per cycle], and
+        # the motion that was missed in them.
         ("frozen", "i8"),
+        ("change", "i8"),
+        ("change_before", "i8"),
         ("motion_missed", "f8"),
         # Highest and lowest torque commanded of late [per mille]; cycles for which the torque
         # actual value has been outside of them, and how far [N·m].
@@ -415,7 +418,7 @@ def _watch(cycle: Record) -> None:
     position = cycle.counts * cycle.rad_per_count
     if not cycle.position_low <= position <= cycle.position_high:
         cycle.trip = _POSITION
-    elif abs(cycle.motion_missed) > cycle.stuck_limit and cycle.frozen == cycle.stuck_cycles:
+    elif cycle.frozen == cycle.stuck_cycles and _is_stuck(cycle):
         cycle.trip = _STUCK
     elif not abs(cycle.estimator[0].v) <= cycle.speed_limit:
         cycle.trip = _SPEED
@@ -428,14 +431,32 @@ def _watch(cycle: Record) -> None:
 
 
 @compiled
-def _compare_position(cycle: Record, moved: bool, missed: int) -> None:
+def _is_stuck(cycle: Record) -> bool:
+    """Whether a handle that does not move any more was going on a moment ago.
+
+    Two witnesses have to agree: the model, which knows the torques, but may have the wrong mass;
+    and the last two changes of the position, carried on: a handle that was stopped slowed down.
+    """
+    last, before = abs(cycle.change), abs(cycle.change_before)
+    went = (last - max(before - last, 0)) * abs(cycle.rad_per_count) * cycle.stuck_cycles
+    return min(went, abs(cycle.motion_missed)) > cycle.stuck_limit
+
+
+@compiled
+def _compare_position(cycle: Record, change: int, missed: int) -> None:
     """How far the position is from the one expected; a jump is a trip before it is made use of.
 
     The estimator expects it where the torques on their way and the force estimated take the
-    handle, after `missed` cycles without a sample as well.
+    handle, after `missed` cycles without a sample as well. `change`: of the position [counts].
     """
     cycle.innovation = cycle.oriented - cycle.estimator[0].y
-    if moved or missed or not cycle.started:
+    if missed or not cycle.started:
+        cycle.change = cycle.change_before = 0
+        cycle.frozen = 0
+        cycle.motion_missed = 0.0
+    elif change:
+        cycle.change_before = cycle.change
+        cycle.change = change
         cycle.frozen = 0
         cycle.motion_missed = 0.0
     else:
@@ -541,7 +562,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
         cycle.missed_tpdo += 1
     _keep_books(cycle, received)
     if received:
-        _compare_position(cycle, cycle.counts != before, missed)
+        _compare_position(cycle, cycle.counts - before, missed)
         observe(estimator, cycle.oriented)
     active = cycle.phase == _RENDERING or cycle.phase == _MEASURING
     due = _is_due(rendered, received) or (received and not active)

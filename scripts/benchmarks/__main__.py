@@ -15,6 +15,7 @@ from on_the_ball import ball, law_steps, planning_steps
 from on_the_bus import exchange, simulated_drive, whole_loop
 from on_the_clock import several_drives, sync_jitter
 from on_the_drive import endurance
+from ways_out import ways_out
 
 Benchmark: TypeAlias = Callable[[], dict[str, Any]]
 
@@ -28,7 +29,7 @@ BENCHMARKS: dict[str, Benchmark] = {
     "planning_steps": planning_steps,
     "ball": ball,
 }
-ON_REQUEST: dict[str, Benchmark] = {"endurance": endurance}
+ON_REQUEST: dict[str, Benchmark] = {"endurance": endurance, "ways_out": ways_out}
 """Minutes each, so they are run when they are named."""
 
 

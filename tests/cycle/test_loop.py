@@ -143,6 +143,29 @@ def test_progress_is_told_now_and_then(make_rig: RigFactory) -> None:
     assert told == [100, 200, 300, 400]
 
 
+@pytest.mark.parametrize(
+    "otherwise",
+    [
+        {},
+        {"mechanics.inertia_kg_m2": 1.6e-3},
+        {"mechanics.inertia_kg_m2": 3e-5},
+        {"mechanics.coulomb_nm": 0.0, "simulation.hand.grip": False},
+        {"simulation.current_bandwidth_hz": 300.0, "simulation.torque_delay_cycles": 1.5},
+        {"bus.cycle_s": 0.00025},
+        {"bus.cycle_s": 0.01},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("law", ["standard", "half_sample", "rigid"])
+def test_no_limit_takes_a_strike_for_a_fault(
+    make_rig: RigFactory, law: str, otherwise: dict[str, Any]
+) -> None:
+    """Chattering, stopped dead, with a model far off, a current loop that lags: none is a fault."""
+    stiff = {"wall.law": law, "wall.stiffness_nm_per_rad": 300.0}
+    loop = Loop(make_rig(settings_with(stiff | otherwise)))
+    assert loop.run(round(1.05 / loop.rig.settings.bus.cycle_s)).trips == []
+
+
 # Before enabling
 
 

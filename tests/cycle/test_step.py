@@ -331,6 +331,21 @@ def test_handle_that_comes_to_rest_or_creeps_is_not_stuck(tremor: int) -> None:
     assert wall.trip() == Trip.NONE
 
 
+def test_model_with_a_mass_ten_times_too_large_takes_no_stop_for_a_stuck_encoder() -> None:
+    heavy = {"mechanics.inertia_kg_m2": 1.6e-3}
+    wall = moving(heavy, 2500, -20)
+    counts = int(wall.cycle["counts"][0])
+    for step_down in (*range(18, 0, -3), *[0] * 20):
+        counts -= step_down
+        wall.at(counts)
+        assert wall.trip() == Trip.NONE
+    assert abs(wall.cycle["motion_missed"][0]) > 2.0 * wall.cycle["stuck_limit"][0]
+    wall = moving(heavy, 2500, -20)
+    for _ in range(5):
+        wall.at(int(wall.cycle["counts"][0]))
+    assert wall.trip() == Trip.STUCK
+
+
 def with_torque(wall: Wall, counts: int, actual: int, statusword: int = ENABLED) -> None:
     wall.give(counts & 0xFFFFFFFF | statusword << 32 | (actual & 0xFFFF) << 48)
 
