@@ -83,7 +83,7 @@ class Limits(Section):
     position_rad: tuple[Number, Number] = (-3.0, 3.0)
     energy_j: Positive | None = None
     jump_rad: Positive | None = None
-    stuck_rad: NonNegative = 0.0005
+    stuck_rad: NonNegative = 0.0006
     stuck_cycles: int = Field(5, ge=3, le=100)
     torque_error_nm: NonNegative | None = None
     torque_error_cycles: int = Field(20, ge=5, le=1000)

@@ -39,8 +39,9 @@ _SILENT_CYCLES = 50
 _LAST_RPDOS = 5
 #: States in which a drive gives no torque until it is enabled anew.
 _DISABLED = (State.SWITCH_ON_DISABLED, State.FAULT)
-#: Cycles before enabling in which position and statusword have to arrive.
-_FIRST_CYCLES = 10
+#: Cycles before enabling in which position and statusword have to arrive; in real time no less
+#: than so long [s]: either process may have other things to do.
+_FIRST_CYCLES, _FIRST_S = 10, 0.2
 
 
 @dataclass
@@ -168,13 +169,16 @@ class _Loop:
 
     def _first_positions(self) -> None:
         waiting = list(self._axes)
-        for _ in range(_FIRST_CYCLES):
+        patience = _FIRST_CYCLES
+        if self._axes[0].settings.real_time:
+            patience = max(patience, round(_FIRST_S / self._period))
+        for _ in range(patience):
             self._exchange.cycle()
             waiting = [axis for axis in waiting if not axis.row["received"][0]]
             if not waiting:
                 break
         else:
-            raise _WallGivenUpError(self._say(waiting[0], f"no TPDO within {_FIRST_CYCLES} SYNCs"))
+            raise _WallGivenUpError(self._say(waiting[0], f"no TPDO within {patience} SYNCs"))
         for axis in self._axes:
             start_at(axis.cycle, int(axis.cycle["counts"][0]))
 

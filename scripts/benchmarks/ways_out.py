@@ -19,7 +19,7 @@ from canwall import config
 _COMMAND = str(Path(sys.executable).with_name("canwall"))
 _RPDO, _TPDO, _EMCY = 0x205, 0x185, 0x085
 _PATIENCE_S = 60.0
-_REPEATS = 5
+_REPEATS = 3
 #: A hand that stays on the wall; default limits and watchdog time but for a machine that is busy.
 _CHANGES = {
     "cycle_s = 0.001": 'cycle_s = 0.001\npace = "real_time"',
@@ -76,7 +76,7 @@ def _measured(missing: tuple[str, ...], number: int) -> tuple[float, float, floa
             frames.pass_time(0.3)
             sent_s = time.time()
             master.send_signal(number)
-            last_s, end_s = frames.last_torque_s, None
+            end_s: float | None = None
             while end_s is None:
                 frame = frames.next()
                 if frame.timestamp < sent_s:
@@ -86,6 +86,7 @@ def _measured(missing: tuple[str, ...], number: int) -> tuple[float, float, floa
             last_s = frames.last_torque_s
             if number == signal.SIGSTOP:
                 master.kill()
+            master.wait(_PATIENCE_S)
             drive.send_signal(signal.SIGINT)
     if last_s is None:
         raise RuntimeError("there was no torque")

@@ -149,7 +149,7 @@ def test_progress_is_told_now_and_then(make_rig: RigFactory) -> None:
         {},
         {"mechanics.inertia_kg_m2": 1.6e-3},
         {"mechanics.inertia_kg_m2": 3e-5},
-        {"mechanics.coulomb_nm": 0.0, "simulation.hand.grip": False},
+        {"mechanics.coulomb_nm": 0.0, "simulation.coulomb_nm": 0.03},
         {"simulation.current_bandwidth_hz": 300.0, "simulation.torque_delay_cycles": 1.5},
         {"bus.cycle_s": 0.00025},
         {"bus.cycle_s": 0.01},
