@@ -115,9 +115,19 @@ def wait_for(condition: Callable[[], bool]) -> None:
 
 def torque_is_on(bus_log: Path) -> bool:
     """Whether the log has an RPDO with a torque by now."""
+    return any(word[8:12] != b"0000" for word in _enabling_rpdos(bus_log))
+
+
+def is_enabled(bus_log: Path) -> bool:
+    """Whether the log has an RPDO by now that keeps the drive enabled."""
+    return bool(_enabling_rpdos(bus_log))
+
+
+def _enabling_rpdos(bus_log: Path) -> list[bytes]:
+    """The last RPDOs of the log with the controlword of OPERATION ENABLED."""
     if not bus_log.exists():
-        return False
+        return []
     with bus_log.open("rb") as file:
         file.seek(max(0, os.path.getsize(bus_log) - 4000))
         words = [line.split()[2] for line in file.read().splitlines()[1:-1]]
-    return any(word.startswith(b"205#0F00") and word[8:12] != b"0000" for word in words)
+    return [word for word in words if word.startswith(b"205#0F00")]

@@ -20,6 +20,7 @@ from commands import (
     Start,
     command,
     config_file,
+    is_enabled,
     read_log,
     same_signals,
     torque_is_on,
@@ -345,7 +346,7 @@ def test_others_may_ask_the_drive_while_it_runs_in_real_time(
         node.sdo.RESPONSE_TIMEOUT = PATIENCE_S
         assert node.sdo["Device type"].raw == 0x20192
         running = start(COMMAND, "run", file, "--duration", 3600, "--output", folder)
-        wait_for(lambda: node.sdo[0x6041].raw & 0x6F == 0x27)
+        wait_for(lambda: is_enabled(folder / "bus.log"))
         for _ in range(20):
             assert node.sdo[0x6041].raw & 0x6F == 0x27
         running.terminate()
