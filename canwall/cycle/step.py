@@ -29,6 +29,7 @@ from canwall.walls import (
     forget,
     note_force,
     observe,
+    pick_up,
     reset_estimator,
     set_estimator,
     set_plant,
@@ -86,6 +87,9 @@ _STUCK_COUNTS = 8
 _JUMP_COUNTS = 2
 #: Without [limits] torque_error_nm: parts of torque_nm, and per mille of the rated torque.
 _TORQUE_ERROR_PART, _TORQUE_ERROR_PER_MILLE = 0.1, 50.0
+
+#: After more cycles than this without a sample the estimate is taken up anew.
+_BLIND_CYCLES = 5
 
 _FIELD = [("shift", "i8"), ("bits", "i8")]
 
@@ -560,9 +564,13 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
         cycle.torque_actual = cycle.torque_per_mille
         cycle.missed_in_a_row += 1
         cycle.missed_tpdo += 1
+    came_from = cycle.oriented
     _keep_books(cycle, received)
     if received:
         _compare_position(cycle, cycle.counts - before, missed)
+        if missed > _BLIND_CYCLES:
+            pause = (1 + missed) * cycle.period
+            pick_up(estimator, cycle.oriented, (cycle.oriented - came_from) / pause)
         observe(estimator, cycle.oriented)
     active = cycle.phase == _RENDERING or cycle.phase == _MEASURING
     due = _is_due(rendered, received) or (received and not active)

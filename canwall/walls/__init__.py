@@ -11,6 +11,7 @@ from canwall.walls.estimator import (
     actuation_state,
     commit,
     observe,
+    pick_up,
     reset_estimator,
     set_estimator,
 )
@@ -45,6 +46,7 @@ __all__ = [
     "law",
     "note_force",
     "observe",
+    "pick_up",
     "reset_estimator",
     "set_estimator",
     "set_plant",

@@ -129,6 +129,17 @@ def observe(estimator: Record, y_sample: float) -> None:
 
 
 @compiled
+def pick_up(estimator: Record, y: float, v: float) -> None:
+    """Begin again at a sample after a time without any, with the mean velocity of that time.
+
+    The steady-state gain holds for one period between two samples: after many it would make a
+    velocity out of what was not foreseen meanwhile.
+    """
+    estimator.y = y
+    estimator.v = v
+
+
+@compiled
 def actuation_state(estimator: Record) -> tuple[float, float]:
     """State (ŷ, ẏ̂) at the instant at which the force computed now takes effect."""
     n = estimator.delay_periods

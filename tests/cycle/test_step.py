@@ -223,6 +223,20 @@ def test_speed_after_missing_tpdos_is_that_of_the_motion() -> None:
     assert blind.at(-7) == torques[-1]
 
 
+def test_estimate_after_a_pause_is_the_mean_velocity_of_the_pause() -> None:
+    overrides = {"limits.hold_cycles": 100, "limits.ramp_cycles": 1000, "wall.position_rad": -2.9}
+    wall = Wall(overrides)
+    start_at(wall.cycle, 500)
+    for counts in (500, 500, 500):
+        wall.at(counts)
+    for _ in range(49):
+        wall.missing()
+    wall.at(300)  # 0.2 rad in 50 ms
+    assert wall.trip() == Trip.NONE
+    assert wall.row["v_est"][0] == pytest.approx(-4.0, abs=0.7)  # a cycle of friction later
+    assert wall.cycle["estimator"]["y"][0, 0] == pytest.approx(0.3, abs=0.01)
+
+
 # Trips
 
 
