@@ -410,7 +410,8 @@ def on_the_bus(*many: Settings) -> Iterator[Link]:
     with ExitStack() as stack:
         if len(many) == 1 and many[0].bus.exchange == "native":
             bus, drive_bus = (stack.enter_context(end) for end in pair(many[0].bus.channel))
-            yield Link(bus, idle=simdrive.BusRunner(drives[0], drive_bus).poll)
+            runner = simdrive.CompiledRunner(drives[0], drive_bus)
+            yield Link(bus, runner.poll, runner.compiled)
             return
         bus = stack.enter_context(open_bus(many[0]))
         polls = [

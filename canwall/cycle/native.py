@@ -19,6 +19,7 @@ from canwall.cycle.native_cycle import (
     EXCHANGE,
     INBOX,
     UNLESS_OPERATIONAL,
+    UNSEEN,
     Result,
     begin,
     run,
@@ -30,6 +31,7 @@ from canwall.rawcan import CFunction, place_port
 from canwall.record.ring import FRAME, HEADER, RECEIVED, Ring, to_message
 
 _EMCY, _ERROR_CONTROL = 0x080, 0x700
+_PDOS = range(0x180, 0x580)
 #: A full transmit buffer is waited for no longer than this in simulated time, and so much of a
 #: cycle in real time.
 _SEND_PATIENCE_S, _SEND_SHARE = 1.0, 0.2
@@ -96,7 +98,8 @@ class NativeExchange(Exchange):
         exchange["missing_timeout_ns"] = _ns(self._missing_timeout_s)
         exchange["axes"], exchange["axes_length"] = self._frames.ctypes.data, len(axes)
         exchange["beats"], exchange["beats_length"] = self._beats.ctypes.data, len(beats)
-        exchange["treatment"] = treatment
+        self._treatment = treatment
+        self._subscribed = -1
         exchange["inbox_header"] = self._inbox.header.ctypes.data
         exchange["inbox"] = self._inbox.frames.ctypes.data
         # What is compiled is loaded at its first call.
@@ -125,6 +128,7 @@ class NativeExchange(Exchange):
             frames["late_limit"] = axis.limits.late_cycles or 0
         self._settle_log()
         self._settle_idle()
+        self._settle_treatment()
         begin(exchange, most)
         while True:
             result = run(exchange)
@@ -166,6 +170,17 @@ class NativeExchange(Exchange):
         exchange["idle"] = link.idle is not None
         function = link.compiled_idle or CFunction(0, 0)
         exchange["idle_function"], exchange["idle_state"] = function
+
+    def _settle_treatment(self) -> None:
+        """PDOs that nobody in Python has subscribed to end in the log."""
+        subscribed = self._link.network.subscribers
+        if len(subscribed) != self._subscribed:
+            self._subscribed = len(subscribed)
+            treatment = self._treatment.copy()
+            for can_id in _PDOS:
+                if not subscribed.get(can_id):
+                    treatment[can_id] = UNSEEN
+            self._exchange["treatment"] = treatment
 
     def _see_frames(self) -> None:
         log = self._link.log

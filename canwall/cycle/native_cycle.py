@@ -70,8 +70,9 @@ _BEFORE, _SYNC_AWAITED, _TPDO_AWAITED = range(3)
 
 _CAN_EFF, CAN_RTR, _CAN_ERR = 1 << 31, 1 << 30, 1 << 29
 _OPERATIONAL = 5
-#: How a CAN-ID is to be treated: seen at once, or only if it tells of another NMT state.
-AT_ONCE, UNLESS_OPERATIONAL = 1, 2
+#: How a CAN-ID is to be treated: seen at once, or only if it tells of another NMT state; seen by
+#: nobody, only logged. 0: seen between two cycles.
+AT_ONCE, UNLESS_OPERATIONAL, UNSEEN = 1, 2, 3
 #: Frames that wait for Python between two looks of it.
 INBOX = 1 << 12
 _BITS_OFF = ~np.uint32(_CAN_EFF | CAN_RTR | _CAN_ERR)
@@ -196,6 +197,8 @@ def _hand_over(exchange: Record) -> None:
     port = exchange.port[0]
     frame = port.frame[0]
     flags = RECEIVED | _flags(frame)
+    if flags == RECEIVED and exchange.treatment[frame.can_id & 0x7FF] == UNSEEN:
+        return
     put_frame(
         elements(exchange.inbox_header, 1, HEADER),
         elements(exchange.inbox, INBOX, LOGGED),
