@@ -50,7 +50,8 @@ class Exchange(ABC):
         self._timeout_s = window_s if real_time else _SIMULATED_TIMEOUT_S
         self._missing_timeout_s = min(self._timeout_s, _MISSING_TIMEOUT_S)
         self.sync_interval = np.zeros(1, HISTOGRAM)
-        self._writer_reads = True
+        #: Whether simulated time waits for the writer of the record; False once it is gone.
+        self.waits_for_writer = True
         for axis in axes:
             _warm_up(axis)
 
@@ -80,9 +81,9 @@ class Exchange(ABC):
         if not self._record_is_behind():
             return
         deadline = time.monotonic() + _WRITER_PATIENCE_S
-        while self._writer_reads and self._record_is_behind():
+        while self.waits_for_writer and self._record_is_behind():
             time.sleep(0.001)
-            self._writer_reads = time.monotonic() < deadline
+            self.waits_for_writer = time.monotonic() < deadline
 
 
 class PythonCanExchange(Exchange):

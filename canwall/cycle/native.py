@@ -123,7 +123,7 @@ class NativeExchange(Exchange):
     def cycle(self, most: int = 1) -> None:
         """One cycle or up to `most`. Raises can.CanError where the bus fails."""
         exchange = self._exchange
-        exchange["writer_reads"] = self._writer_reads
+        exchange["writer_reads"] = self.waits_for_writer
         for axis, frames in zip(self.axes, self._frames, strict=True):
             frames["late_limit"] = axis.limits.late_cycles or 0
         self._settle_log()
@@ -140,7 +140,7 @@ class NativeExchange(Exchange):
                 self._link.idle()
             elif result == Result.RECORD_BEHIND:
                 self._wait_for_writer()
-                exchange["writer_reads"] = self._writer_reads
+                exchange["writer_reads"] = self.waits_for_writer
             elif result != Result.SEEN_FIRST:
                 self._give_up(result)
         self._tell_axes()

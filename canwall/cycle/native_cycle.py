@@ -73,6 +73,8 @@ _OPERATIONAL = 5
 #: How a CAN-ID is to be treated: seen at once, or only if it tells of another NMT state; seen by
 #: nobody, only logged. 0: seen between two cycles.
 AT_ONCE, UNLESS_OPERATIONAL, UNSEEN = 1, 2, 3
+#: This long after a SYNC the bus is looked at awake.
+_LOOK_NS = 30_000
 #: Frames that wait for Python between two looks of it.
 INBOX = 1 << 12
 _BITS_OFF = ~np.uint32(_CAN_EFF | CAN_RTR | _CAN_ERR)
@@ -127,6 +129,7 @@ EXCHANGE = np.dtype(
         ("left", "i8"),  # cycles that are still to be done in this call
         ("strikes", "i8"),
         ("wait_until_ns", "i8"),
+        ("looked_ns", "i8"),
         ("axes", "u8"),
         ("axes_length", "i8"),
         ("beats", "u8"),
@@ -306,6 +309,7 @@ def _begin(exchange: Record, sync_ns: int) -> None:
     if _missing(exchange):
         timeout = exchange.missing_timeout_ns
     exchange.wait_until_ns = sync_ns + timeout
+    exchange.looked_ns = sync_ns
     axes = elements(exchange.axes, exchange.axes_length, AXIS)
     for k in range(len(axes)):
         axes[k].awaited = True
@@ -472,7 +476,9 @@ def _nothing_came(exchange: Record) -> int:
             return _NO_SYNC
         return _DONE if _give_up_waiting(exchange) else _ERRNO
     if not exchange.idle:
-        wait_readable(port, exchange.descriptor, left_ns)
+        # A drive that answers at once is not worth a sleep, which costs more than its answer.
+        if now_ns(port) - exchange.looked_ns > _LOOK_NS:
+            wait_readable(port, exchange.descriptor, left_ns)
     elif not exchange.idle_function or not _call_idle(exchange.idle_function, exchange.idle_state):
         return _IDLE
     return _DONE
