@@ -6,7 +6,7 @@ Prepare everything that can fail on bad input, then touch the bus, then the driv
 import json
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,9 @@ from canwall.config import ConfigError, Settings
 from canwall.cycle import (
     Axis,
     Change,
+    Exchange,
     ExternalSync,
+    NativeExchange,
     Outcome,
     PythonCanExchange,
     Watch,
@@ -36,6 +38,7 @@ from canwall.drive import REQUIRED_OBJECTS, DriveError, DriveNode, DriveSetup, L
 from canwall.eds import load_eds
 from canwall.errors import RunFailedError
 from canwall.live import open_to_changes
+from canwall.pair import pair
 from canwall.plots import plot_run
 from canwall.record import Recorder, RecordError, Ring, RunFolder, read_signals
 from canwall.referent import referent_positions
@@ -46,6 +49,9 @@ Array = NDArray[np.float64]
 
 #: What asks a run to end.
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+#: How long compiled code keeps the cycle before the loop looks after signals, messages and changes
+#: [s of bus time].
+_LOOKS_S, _SIMULATED_LOOKS_S = 0.02, 1.0
 
 
 class StopRequest:
@@ -156,8 +162,11 @@ def make_axis(
     return Axis(node, setup, settings, laws, ring, changes)
 
 
-def make_exchange(link: Link, axes: Sequence[Axis]) -> PythonCanExchange:
-    """The cycle of all axes, on the SYNC that `[bus]` says. Raises DriveError."""
+def make_exchange(link: Link, axes: Sequence[Axis]) -> Exchange:
+    """The cycle of all axes, on the SYNC and by the exchange that `[bus]` says.
+
+    Raises DriveError, and ConfigError for an exchange that the bus does not have.
+    """
     settings, setup = axes[0].settings, axes[0].setup
     for axis in axes[1:]:
         other = axis.setup
@@ -168,8 +177,18 @@ def make_exchange(link: Link, axes: Sequence[Axis]) -> PythonCanExchange:
             raise DriveError(
                 f"{axis.name} wants another SYNC than {axes[0].name}: make 0x1005 and 0x1019 equal"
             )
+    external = settings.bus.sync == "external"
+    if settings.bus.exchange != "python-can":
+        try:
+            exchange = NativeExchange(link, axes, settings.real_time, external)
+            looks_s = _LOOKS_S if settings.real_time else _SIMULATED_LOOKS_S
+            exchange.ahead = max(1, round(looks_s / settings.bus.cycle_s))
+            return exchange
+        except can.CanInitializationError as error:
+            if settings.bus.exchange == "native":
+                raise ConfigError(f"bus.exchange = 'native': {error}") from None
     sync = None
-    if settings.bus.sync == "external":
+    if external:
         sync = ExternalSync(link, setup.sync_cob_id, settings.bus.cycle_s)
     return PythonCanExchange(link, axes, settings.real_time, sync)
 
@@ -181,7 +200,7 @@ def make_watch(link: Link, axes: Sequence[Axis]) -> Watch:
 
 
 def render(
-    exchange: PythonCanExchange,
+    exchange: Exchange,
     stop: Callable[[], bool],
     progress: Callable[[float], None] = lambda now_s: None,
 ) -> Outcome:
@@ -261,6 +280,7 @@ def run_together(
                 watch = make_watch(link, axes)
                 report("rendering")
                 with (
+                    closing(exchange),
                     open_to_changes(axes, folders),
                     stop_on_signals() as stop,
                     scheduled(first) as scheduling,
@@ -329,7 +349,7 @@ def _run_folders(many: Sequence[Settings], output: Path | None) -> list[RunFolde
 
 def _result(
     axis: Axis,
-    exchange: PythonCanExchange,
+    exchange: Exchange,
     watch: Watch,
     scheduling: str,
     folder: RunFolder,
@@ -353,6 +373,7 @@ def _result(
         "delay_cycles": axis.delay,
         "drive": _described(axis.setup),
         "timing": {
+            "exchange": exchange.name,
             "scheduling": scheduling,
             "sync_interval": timing_summary(exchange.sync_interval),
             "tpdo_to_rpdo": timing_summary(axis.latency),
@@ -387,6 +408,11 @@ def on_the_bus(*many: Settings) -> Iterator[Link]:
         return
     drives = [make_simulated_drive(settings) for settings in many]
     with ExitStack() as stack:
+        if len(many) == 1 and many[0].bus.exchange == "native":
+            bus, drive_bus = (stack.enter_context(end) for end in pair(many[0].bus.channel))
+            runner = simdrive.CompiledRunner(drives[0], drive_bus)
+            yield Link(bus, runner.poll, runner.compiled)
+            return
         bus = stack.enter_context(open_bus(many[0]))
         polls = [
             simdrive.BusRunner(drive, stack.enter_context(open_bus(settings))).poll

@@ -47,7 +47,8 @@ _REFUSALS = {
 }
 
 
-def _encode(msg: can.Message) -> bytes:
+def encode_frame(msg: can.Message) -> bytes:
+    """The packet of a message. Raises can.CanOperationError for what the bus cannot carry."""
     if msg.is_fd:
         raise can.CanOperationError("unixcan carries classical CAN frames, not CAN FD")
     # The length of the data counts: canopen changes the data of a periodic message, not its DLC.
@@ -64,7 +65,8 @@ def _encode(msg: can.Message) -> bytes:
     return _FRAME.pack(can_id, length, msg.data)
 
 
-def _decode(frame: bytes, channel: str, is_rx: bool) -> can.Message:
+def decode_frame(frame: bytes, channel: str, is_rx: bool) -> can.Message:
+    """The message of a packet that has come now."""
     can_id, length, data = _FRAME.unpack(frame)
     return can.Message(
         timestamp=time.time(),
@@ -79,14 +81,15 @@ def _decode(frame: bytes, channel: str, is_rx: bool) -> can.Message:
     )
 
 
-def _prepared(sock: socket.socket) -> socket.socket:
+def prepared(sock: socket.socket) -> socket.socket:
+    """The socket, not blocking, with room for many frames that the other side has not read."""
     sock.setblocking(False)
     # What a peer has not read counts against the sender's buffer; SO_RCVBUF has no say (unix(7)).
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
     return sock
 
 
-def _receive(sock: socket.socket) -> bytes | None:
+def receive_frame(sock: socket.socket) -> bytes | None:
     """Return the next frame, b"" if the peer has left, None if there is no (valid) frame now."""
     try:
         frame = sock.recv(_FRAME.size + 1)
@@ -139,7 +142,7 @@ class _Inbox:
 
     def put(self, frame: bytes, is_rx: bool = True) -> None:
         if len(self.frames) < _INBOX_FRAMES:
-            self.frames.append(_decode(frame, self._channel, is_rx))
+            self.frames.append(decode_frame(frame, self._channel, is_rx))
         else:
             self.overruns += 1
 
@@ -154,7 +157,7 @@ class _Client:
 
     def __init__(self, channel: str, inbox: _Inbox) -> None:
         self._inbox = inbox
-        self._socket = _prepared(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
+        self._socket = prepared(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
         try:
             self._socket.connect(channel)
         except OSError:
@@ -172,14 +175,14 @@ class _Client:
         """Take one frame in if the inbox is empty; return False once the hub is gone."""
         if self._inbox.frames:
             return True
-        frame = _receive(self._socket)
+        frame = receive_frame(self._socket)
         if frame:
             self._inbox.put(frame)
         return frame != b""
 
     def drain(self) -> None:
         """Take in what the hub had sent before it went."""
-        while frame := _receive(self._socket):
+        while frame := receive_frame(self._socket):
             self._inbox.put(frame)
 
     def close(self) -> None:
@@ -247,12 +250,12 @@ class _Hub:
         with contextlib.suppress(OSError):
             while True:
                 client, _address = self._listener.accept()
-                _prepared(client)
+                prepared(client)
                 self._sockets.register(client, select.EPOLLIN)
                 self._clients = {**self._clients, client.fileno(): client}
 
     def _relay(self, client: socket.socket) -> None:
-        frame = _receive(client)
+        frame = receive_frame(client)
         if frame:
             self._forward(frame, client)
             self._inbox.put(frame)
@@ -410,7 +413,7 @@ class UnixBus(can.BusABC):
         :raises can.CanOperationError: a frame that the bus cannot carry, transmit buffer full, no
             hub any more, or the bus is shut down.
         """
-        frame = _encode(msg)
+        frame = encode_frame(msg)
         start = None
         while True:
             with self._inbox:
@@ -431,6 +434,18 @@ class UnixBus(can.BusABC):
             if time.monotonic() - start >= limit:
                 raise can.CanOperationError(f"{self.channel_info}: {reason}")
             time.sleep(_RETRY_S)
+
+    def frame_descriptor(self) -> int | None:
+        """Descriptor of the connection to the hub, a packet a frame; None: this is the hub.
+
+        Whoever reads it takes frames away from recv(). After the hub has left, another one is
+        joined first.
+        """
+        with self._inbox:
+            self._require_open()
+            if isinstance(self._link, _Client) and not self._link.pump():
+                self._rejoin()
+            return self._link.fileno() if isinstance(self._link, _Client) else None
 
     def fileno(self) -> int:
         """Descriptor that polls readable when recv() has a frame or work to do; -1 when shut."""

@@ -13,9 +13,20 @@ from numpy.typing import NDArray
 
 from canwall import config, simdrive
 from canwall.config import Settings
-from canwall.cycle import Axis, Change, Outcome, PythonCanExchange, run_laws, run_loop
+from canwall.cycle import (
+    Axis,
+    Change,
+    Exchange,
+    ExternalSync,
+    NativeExchange,
+    Outcome,
+    PythonCanExchange,
+    run_laws,
+    run_loop,
+)
 from canwall.drive import REQUIRED_OBJECTS, DriveNode, DriveSetup, Link, set_up
 from canwall.eds import load_eds
+from canwall.pair import pair
 from canwall.record import Ring
 from canwall.run import make_watch
 
@@ -99,13 +110,22 @@ class Rig:
     """Drive, bus and master; `frames` is every frame that the master sent and received."""
 
     def __init__(
-        self, settings: Settings | None = None, bus: Callable[[str], can.BusABC] = VirtualBus
+        self,
+        settings: Settings | None = None,
+        bus: Callable[[str], can.BusABC] = VirtualBus,
+        native: bool = False,
     ) -> None:
+        """`native`: on a socket pair, for the exchange in compiled code."""
+        self.native = native
         self.settings = settings or settings_with()
         assert self.settings.simulation is not None
         channel = f"rig {next(_channels)}"
-        self.bus = bus(channel)
-        self.drive_bus = VirtualBus(channel)
+        self.bus: can.BusABC
+        self.drive_bus: can.BusABC
+        if native:
+            self.bus, self.drive_bus = pair(channel)
+        else:
+            self.bus, self.drive_bus = bus(channel), VirtualBus(channel)
         self.tampering = Tampering(
             simdrive.make_drive(
                 self.settings.drive, self.settings.simulation, self.settings.bus.cycle_s
@@ -153,8 +173,16 @@ class Loop:
         self.ring = Ring.create()
         self.axis = Axis(rig.node, self.setup, rig.settings, self.laws, self.ring)
         self.record = self.axis.cycle
-        self.exchange = PythonCanExchange(rig.link, [self.axis], real_time)
+        self.exchange = self.make_exchange(real_time)
         self.watch = make_watch(rig.link, [self.axis])
+
+    def make_exchange(self, real_time: bool = False, external_sync: bool = False) -> Exchange:
+        """The exchange that the rig is for, with its own SYNC or somebody else's."""
+        link, axes = self.rig.link, [self.axis]
+        if self.rig.native:
+            return NativeExchange(link, axes, real_time, external_sync)
+        sync = ExternalSync(link, SYNC, 0.001) if external_sync else None
+        return PythonCanExchange(link, axes, real_time, sync)
 
     def run(
         self,

@@ -104,9 +104,10 @@ def witnesses(monkeypatch: pytest.MonkeyPatch) -> list[Witness]:
     return found
 
 
-def run_with(folder: Path, toml: str) -> int:
+def run_with(folder: Path, toml: str, exchange: str) -> int:
     """`canwall run` in this process; its exit code."""
     changes = {
+        "cycle_s = 0.001": f'cycle_s = 0.001\nexchange = "{exchange}"',
         "duration_s = 4.2": f"duration_s = {DURATION_S}",
         'law = "standard" ': 'law = "half_sample" ',
     }
@@ -124,10 +125,10 @@ def cycles_with(torque: "np.ndarray[tuple[int], np.dtype[np.int64]]", at: int) -
 
 
 def found_case(
-    case: Case, folder: Path, witnesses: list[Witness], errors: Callable[[], str]
+    case: Case, folder: Path, witnesses: list[Witness], errors: Callable[[], str], exchange: str
 ) -> Case:
     """What really happens."""
-    code = run_with(folder, case.toml)
+    code = run_with(folder, case.toml, exchange)
     said = [line.removeprefix("canwall: ") for line in errors().splitlines()]
     record = Record(folder / "run")
     assert_whole(record, said)
@@ -163,14 +164,16 @@ def assert_whole(record: Record, said: list[str]) -> None:
     assert (record.folder / "trip.csv").exists() == (record.summary["trip_cycle"] is not None)
 
 
+@pytest.mark.parametrize("exchange", ["python-can", "native"])
 @pytest.mark.parametrize("case", cases(), ids=lambda case: f"{case.fault}, {case.when}")
 def test_case(
     case: Case,
+    exchange: str,
     tmp_path: Path,
     witnesses: list[Witness],
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    found = found_case(case, tmp_path, witnesses, lambda: capfd.readouterr().err)
+    found = found_case(case, tmp_path, witnesses, lambda: capfd.readouterr().err, exchange)
     pattern = ".+".join(map(re.escape, case.message.split("…")))
     assert re.fullmatch(pattern, found.message), found.message
     for most, cycles in ((case.commanded, found.commanded), (case.drive, found.drive)):

@@ -9,10 +9,12 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from canwall.bench.budget import USABLE, CyclicFrame, bus_budget
 from canwall.config import Settings
 from canwall.drive import DriveError, DriveNode, DriveSetup, Link, PdoLayout, set_up
 from canwall.drive import objects as od
 from canwall.drive.cia402 import State, state_of, status_text
+from canwall.drive.pdo import tpdos_on_sync
 from canwall.drive.trial import Trial
 from canwall.eds import load_eds
 from canwall.errors import RunFailedError
@@ -69,6 +71,7 @@ def examine(
         lenient = settings.drive.model_copy(update={"accept_no_watchdog": True})
         setup = set_up(node, lenient, settings.bus, real_time=True)
         _describe(setup, settings, findings)
+        _describe_budget(node, setup, settings, findings)
         _test(node, setup, settings, announce, findings)
     finally:
         announce("putting the drive back as it was")
@@ -106,6 +109,36 @@ def _describe(setup: DriveSetup, settings: Settings, findings: Findings) -> None
     )
     for passed_over in watchdog.passed_over:
         findings.add("watchdog", "passed over", passed_over)
+
+
+def _describe_budget(
+    node: DriveNode, setup: DriveSetup, settings: Settings, findings: Findings
+) -> None:
+    """All that the drive sends with a SYNC, whether the wall needs it or not."""
+    bus, counted = settings.bus, 1 if setup.sync_counter_overflow else 0
+    budget = bus_budget(
+        CyclicFrame("SYNC", setup.sync_cob_id, counted),
+        [CyclicFrame("TPDO", tpdo.cob_id, tpdo.length) for tpdo in tpdos_on_sync(node)],
+        [CyclicFrame("RPDO", setup.rpdo.cob_id, setup.rpdo.length)],
+        bus.bitrate,
+        bus.cycle_s,
+    )
+    for line in budget.lines:
+        frame = line.frame
+        over = f"{line.earliest_s * 1e6:.0f} to {line.latest_s * 1e6:.0f} µs"
+        findings.add(
+            "bus budget",
+            f"{frame.name} {frame.can_id:#05x}, {frame.length} bytes",
+            f"at most {line.bits} bits, {line.share:.1%} of the cycle; over {over} after the SYNC "
+            f"begins, by the bus alone",
+        )
+    findings.add(
+        "bus budget",
+        f"cycle of {bus.cycle_s * 1e3:g} ms at {bus.bitrate / 1000:g} kbit/s",
+        f"{budget.share:.1%} used of {USABLE:.0%} that leave room for SDO, EMCY and heartbeats; "
+        f"the highest rate that fits is {budget.highest_hz:g} Hz",
+        well=budget.fits,
+    )
 
 
 def _shown(pdo: PdoLayout) -> str:

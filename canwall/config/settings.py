@@ -20,6 +20,7 @@ class Bus(Section):
     cycle_s: Annotated[Positive, Field(le=1.0)] = 0.001
     pace: Literal["auto", "real_time", "simulated"] = "auto"
     sync: Literal["produce", "external"] = "produce"
+    exchange: Literal["auto", "python-can", "native"] = "auto"
     master_id: int = Field(127, ge=1, le=127)
 
 

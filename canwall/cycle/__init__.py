@@ -2,9 +2,10 @@
 
 from canwall.cycle.axis import Axis, Change
 from canwall.cycle.delay import measured_delay
-from canwall.cycle.exchange import PythonCanExchange
+from canwall.cycle.exchange import Exchange, PythonCanExchange
 from canwall.cycle.laws import run_laws
 from canwall.cycle.loop import Outcome, run_loop
+from canwall.cycle.native import NativeExchange
 from canwall.cycle.realtime import real_time_priority
 from canwall.cycle.step import (
     CYCLE,
@@ -26,7 +27,9 @@ __all__ = [
     "MAX_LAWS",
     "Axis",
     "Change",
+    "Exchange",
     "ExternalSync",
+    "NativeExchange",
     "Outcome",
     "ProducedSync",
     "PythonCanExchange",

@@ -6,27 +6,38 @@ from collections.abc import Iterable
 import can
 
 from canwall.drive import Link, Watchdog
+from canwall.drive.watchdog import Beat
+
+
+def periods_ns(watchdogs: Iterable[Watchdog]) -> dict[Beat, int]:
+    """The signs of life that these watchdogs want to hear, and how often each.
+
+    Drives that listen to the same heartbeat get it as often as the shortest one wants.
+    """
+    periods: dict[Beat, float] = {}
+    for watchdog in watchdogs:
+        beat = watchdog.beat
+        if beat is not None:
+            periods[beat] = min(watchdog.period_s, periods.get(beat, watchdog.period_s))
+    return {beat: round(period * 1e9) for beat, period in periods.items()}
 
 
 class Beats:
     """Sends what the watchdogs of all drives want to hear, each when it is due."""
 
     def __init__(self, link: Link, watchdogs: Iterable[Watchdog]) -> None:
-        """Drives that listen to the same heartbeat get it as often as the shortest one wants."""
         self._link = link
-        periods: dict[tuple[int, bytes, bool], float] = {}
-        for watchdog in watchdogs:
-            beat = watchdog.beat
-            if beat is not None:
-                key = beat.can_id, beat.data, beat.remote
-                periods[key] = min(watchdog.period_s, periods.get(key, watchdog.period_s))
+        periods = periods_ns(watchdogs)
         self._messages = [
             can.Message(
-                arbitration_id=can_id, data=data, is_remote_frame=remote, is_extended_id=False
+                arbitration_id=beat.can_id,
+                data=beat.data,
+                is_remote_frame=beat.remote,
+                is_extended_id=False,
             )
-            for can_id, data, remote in periods
+            for beat in periods
         ]
-        self._periods_ns = [round(period * 1e9) for period in periods.values()]
+        self._periods_ns = list(periods.values())
         self._due_ns = [0] * len(periods)
 
     def __bool__(self) -> bool:

@@ -1,6 +1,7 @@
 """The exchange of one cycle's frames over python-can, for any adapter that it supports."""
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
@@ -23,17 +24,72 @@ _MISSING_TIMEOUT_S = 0.05
 #: The part of a real cycle in which the TPDO has to arrive, for the RPDO to be in time.
 _SYNCHRONOUS_WINDOW = 0.8
 #: How full the ring of the record may be before simulated time waits for its writer.
-_BACKLOG = 0.5
+BACKLOG = 0.5
 #: A writer that takes nothing for this long is taken for gone; what is lost is counted.
 _WRITER_PATIENCE_S = 10.0
 
 
-class PythonCanExchange:
-    """SYNC, TPDOs, steps, RPDOs: one cycle of all axes at a time.
+class Exchange(ABC):
+    """SYNC, TPDOs, steps, RPDOs: the cycle of all axes, in whatever way its frames are exchanged.
 
     In real time the SYNCs keep to absolute deadlines; in simulated time they follow one another
     as fast as the drives answer.
     """
+
+    #: How it is called in a summary.
+    name: str
+    #: How many cycles it may do before the loop looks after everything else again.
+    ahead = 1
+
+    def __init__(self, link: Link, axes: Sequence[Axis], real_time: bool) -> None:
+        self._link = link
+        self.axes = axes
+        self._real_time = real_time
+        self._period_s = float(axes[0].cycle["period"][0])
+        window_s = self._period_s * _SYNCHRONOUS_WINDOW
+        self._timeout_s = window_s if real_time else _SIMULATED_TIMEOUT_S
+        self._missing_timeout_s = min(self._timeout_s, _MISSING_TIMEOUT_S)
+        self.sync_interval = np.zeros(1, HISTOGRAM)
+        #: Whether simulated time waits for the writer of the record; False once it is gone.
+        self.waits_for_writer = True
+        for axis in axes:
+            _warm_up(axis)
+
+    @abstractmethod
+    def cycle(self, most: int = 1) -> None:
+        """One cycle; or, where there is nothing to be done in between, several, `most` at most.
+
+        Raises can.CanError where the bus fails.
+        """
+
+    def close(self) -> None:  # noqa: B027 (only some have anything to give back)
+        """Give back what the exchange has opened; the link stays open."""
+
+    def _check_late(self, axis: Axis) -> None:
+        """Give the wall up whose RPDOs have come too late for too many cycles."""
+        most = axis.limits.late_cycles
+        if most and axis.late_in_a_row >= most:
+            axis.give_up(
+                f"RPDOs after the next SYNC for {axis.late_in_a_row} cycles, limits.late_cycles = "
+                f"{most}: the machine is too slow for bus.cycle_s"
+            )
+
+    def _record_is_behind(self) -> bool:
+        return any(axis.ring.backlog() > BACKLOG for axis in self.axes)
+
+    def _wait_for_writer(self) -> None:
+        if not self._record_is_behind():
+            return
+        deadline = time.monotonic() + _WRITER_PATIENCE_S
+        while self.waits_for_writer and self._record_is_behind():
+            time.sleep(0.001)
+            self.waits_for_writer = time.monotonic() < deadline
+
+
+class PythonCanExchange(Exchange):
+    """The exchange over python-can, for any adapter that it supports."""
+
+    name = "python-can"
 
     def __init__(
         self,
@@ -43,34 +99,26 @@ class PythonCanExchange:
         sync: SyncSource | None = None,
     ) -> None:
         """Without a `sync`, the master produces it as the first axis' drive wants it."""
-        self._link = link
-        self.axes = axes
-        self._real_time = real_time
-        period_s = float(axes[0].cycle["period"][0])
+        super().__init__(link, axes, real_time)
         setup = axes[0].setup
         self._sync = sync or ProducedSync(
-            link, setup.sync_cob_id, setup.sync_counter_overflow, period_s, real_time
+            link, setup.sync_cob_id, setup.sync_counter_overflow, self._period_s, real_time
         )
-        self._timeout_s = period_s * _SYNCHRONOUS_WINDOW if real_time else _SIMULATED_TIMEOUT_S
         self._by_tpdo = {axis.setup.tpdo.cob_id: axis for axis in axes}
         self._rpdos = {
             id(axis): CyclicFrame(axis.setup.rpdo.cob_id, axis.setup.rpdo.length) for axis in axes
         }
         self._beats = Beats(link, (axis.setup.watchdog for axis in axes))
-        self.sync_interval = np.zeros(1, HISTOGRAM)
         self._last_sync_ns = 0
-        self._writer_reads = True
-        for axis in axes:
-            _warm_up(axis)
 
-    def cycle(self) -> None:
+    def cycle(self, most: int = 1) -> None:
         """One cycle. Raises can.CanError where the bus fails."""
         missing = any(axis.cycle["missed_in_a_row"][0] for axis in self.axes)
         if not self._real_time:
             self._wait_for_writer()
         interval_s = self._begin()
         awaited = self._by_tpdo.copy()
-        timeout = min(self._timeout_s, _MISSING_TIMEOUT_S) if missing else self._timeout_s
+        timeout = self._missing_timeout_s if missing else self._timeout_s
         deadline = time.monotonic() + timeout
         while awaited:
             message = self._link.wait_for(awaited, timeout)
@@ -90,15 +138,6 @@ class PythonCanExchange:
             self._answer(axis, 0, False, time.perf_counter_ns(), interval_s)
         if self._beats:
             self._beats.send()
-
-    def _wait_for_writer(self) -> None:
-        rings = [axis.ring for axis in self.axes]
-        if all(ring.backlog() <= _BACKLOG for ring in rings):
-            return
-        deadline = time.monotonic() + _WRITER_PATIENCE_S
-        while self._writer_reads and any(ring.backlog() > _BACKLOG for ring in rings):
-            time.sleep(0.001)
-            self._writer_reads = time.monotonic() < deadline
 
     def _begin(self) -> float:
         """The SYNC; seconds since the one before, 0 for the first."""
@@ -124,18 +163,11 @@ class PythonCanExchange:
         row["sync_interval_s"] = interval_s
         row["latency_s"] = latency * 1e-9
         if self._real_time:
-            self._note_late(axis, sent_ns > self._sync.deadline_ns)
+            late = sent_ns > self._sync.deadline_ns
+            axis.late_rpdo += late
+            axis.late_in_a_row = axis.late_in_a_row + 1 if late else 0
+            self._check_late(axis)
         put_row(axis.ring.header, axis.ring.rows, axis.row)
-
-    def _note_late(self, axis: Axis, late: bool) -> None:
-        axis.late_rpdo += late
-        axis.late_in_a_row = axis.late_in_a_row + 1 if late else 0
-        most = axis.limits.late_cycles
-        if most and axis.late_in_a_row >= most:
-            axis.give_up(
-                f"RPDOs after the next SYNC for {axis.late_in_a_row} cycles, limits.late_cycles = "
-                f"{most}: the machine is too slow for bus.cycle_s"
-            )
 
 
 def _warm_up(axis: Axis) -> None:

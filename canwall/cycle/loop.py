@@ -14,7 +14,7 @@ import can
 from canwall import config
 from canwall.cycle.axis import Axis, Change
 from canwall.cycle.delay import DelayTest
-from canwall.cycle.exchange import PythonCanExchange
+from canwall.cycle.exchange import Exchange
 from canwall.cycle.step import Trip, fade_in, fade_over, set_delay, set_limits, set_wall, start_at
 from canwall.drive import (
     Controlword,
@@ -61,7 +61,7 @@ class _WallGivenUpError(Exception):
 
 
 def run_loop(
-    exchange: PythonCanExchange,
+    exchange: Exchange,
     cycles: int | None,
     stop: Callable[[], bool],
     progress: Callable[[int], None] = lambda j: None,
@@ -120,7 +120,7 @@ def _leave(loop: "_Loop", outcome: Outcome) -> None:
 class _Loop:
     def __init__(
         self,
-        exchange: PythonCanExchange,
+        exchange: Exchange,
         stop: Callable[[], bool],
         progress: Callable[[int], None],
     ) -> None:
@@ -196,11 +196,24 @@ class _Loop:
                 return True
             for axis, changes in pending:
                 _change(axis, changes, self._period)
-            self._exchange.cycle()
+            self._exchange.cycle(self._most(cycles, pending))
             self._check()
             if self.j % self._progress_every == 0:
                 self._progress(self.j)
         return False
+
+    def _most(self, cycles: int | None, pending: list[tuple[Axis, list[Change]]]) -> int:
+        """Cycles until there is something to be done: the end, progress to be told, a change."""
+        ends = [self.j + self._exchange.ahead]
+        ends.append((self.j // self._progress_every + 1) * self._progress_every)
+        if cycles is not None:
+            ends.append(cycles)
+        for axis, changes in pending:
+            ends += [change.j for change in changes[:1]]
+            # A change that is due waits for the one before to be complete.
+            if fading := int(axis.cycle["fade_left"][0]):
+                ends.append(self.j + fading)
+        return max(1, min(ends) - self.j)
 
     def _measure_delays(self) -> bool:
         """Find the delay of the axes that ask for it; whether it was stopped before."""

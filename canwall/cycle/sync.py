@@ -9,13 +9,21 @@ from canwall.cycle.frames import CyclicFrame
 from canwall.drive import Link
 
 #: The last part of a wait is spent awake: a sleep ends when the scheduler likes.
-_SPIN_NS = 200_000
+SPIN_NS = 200_000
 #: Without a SYNC for this long, and no less than so many periods, its producer is gone.
 _SILENCE_S, _SILENT_PERIODS = 0.1, 10
 
 
 class SyncLostError(can.CanOperationError):
     """The producer of the SYNC has fallen silent."""
+
+    def __init__(self, patience_s: float) -> None:
+        super().__init__(f"no SYNC from its producer for {patience_s:g} s")
+
+
+def sync_patience_s(period_s: float) -> float:
+    """Silence after which the producer of the SYNC is gone."""
+    return max(_SILENCE_S, _SILENT_PERIODS * period_s)
 
 
 class SyncSource(Protocol):
@@ -70,7 +78,7 @@ class ProducedSync:
         now = time.perf_counter_ns()
         if self.deadline_ns == 0:
             self.deadline_ns = now
-        asleep_ns = self.deadline_ns - now - _SPIN_NS
+        asleep_ns = self.deadline_ns - now - SPIN_NS
         if asleep_ns > 0:
             time.sleep(asleep_ns * 1e-9)
         self._serve_all()
@@ -91,13 +99,13 @@ class ExternalSync:
         self._link = link
         self._cob_ids = (cob_id,)
         self._period_ns = round(period_s * 1e9)
-        self._patience_s = max(_SILENCE_S, _SILENT_PERIODS * period_s)
+        self._patience_s = sync_patience_s(period_s)
         self.deadline_ns = 0
 
     def next(self) -> int:
         """Wait for the SYNC. Raises SyncLostError."""
         if self._link.wait_for(self._cob_ids, self._patience_s) is None:
-            raise SyncLostError(f"no SYNC from its producer for {self._patience_s:g} s")
+            raise SyncLostError(self._patience_s)
         now = time.perf_counter_ns()
         self.deadline_ns = now + self._period_ns
         return now

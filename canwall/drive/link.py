@@ -16,6 +16,8 @@ import canopen
 from canopen.sdo import SdoClient
 from canopen.sdo.exceptions import SdoCommunicationError
 
+from canwall.rawcan import CFunction
+
 # What fails is raised; canopen logs it as well, which without a handler goes to stderr.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
 
@@ -34,28 +36,33 @@ class Link:
     """A python-can bus with canopen's network on it.
 
     idle: what to do while nothing is waiting on the bus, instead of blocking. An embedded
-    simulated drive lives in these moments.
+    simulated drive lives in these moments. compiled_idle: a C function that does the same for
+    compiled code, and returns 0 where idle is to be called after all.
     """
 
-    def __init__(self, bus: can.BusABC, idle: Callable[[], None] | None = None) -> None:
-        self._bus = bus
+    def __init__(
+        self,
+        bus: can.BusABC,
+        idle: Callable[[], None] | None = None,
+        compiled_idle: CFunction | None = None,
+    ) -> None:
+        self.bus = bus
         self.idle = idle
+        self.compiled_idle = compiled_idle
         self.log: FrameLog | None = None
         self.on_error_frame: Callable[[can.Message], None] | None = None
         self.network = _Network(self)
 
     def send(self, message: can.Message) -> None:
         """Send and take note of it. Raises can.CanError."""
-        self._bus.send(message)
+        self.bus.send(message)
         if self.log is not None:
             self.log(time.time(), message, False)
 
     def receive(self, timeout_s: float) -> can.Message | None:
         """The next frame, or None if there is none within the time. Raises can.CanError."""
-        if self.idle is None:
-            message = self._bus.recv(timeout_s)
-        else:
-            message = self._receive_idling(timeout_s)
+        idle = self.idle
+        message = self.bus.recv(timeout_s) if idle is None else self._receive_idling(timeout_s)
         if message is not None and self.log is not None:
             self.log(message.timestamp, message, True)
         return message
@@ -64,7 +71,7 @@ class Link:
         assert self.idle is not None
         deadline = time.monotonic() + timeout_s
         while True:
-            message = self._bus.recv(0)
+            message = self.bus.recv(0)
             if message is not None or time.monotonic() >= deadline:
                 return message
             self.idle()
@@ -109,7 +116,7 @@ class Link:
 
     def close(self) -> None:
         """Leave the bus."""
-        self._bus.shutdown()
+        self.bus.shutdown()
 
 
 class _Network(canopen.Network):  # type: ignore[misc]

@@ -219,6 +219,16 @@ def _present(node: DriveNode, first: int) -> Iterator[PdoLayout]:
             yield _layout(communication, cob_id, _read_mapping(node, mapping))
 
 
+def tpdos_on_sync(node: DriveNode) -> list[PdoLayout]:
+    """All TPDOs that the drive sends with SYNCs, every one or some. Raises DriveError."""
+    return [
+        layout
+        for layout in _present(node, od.TPDO_COMMUNICATION)
+        if not node.read(layout.communication, 1) & _INVALID
+        and 1 <= node.read(layout.communication, 2) < _SYNCHRONOUS.stop
+    ]
+
+
 def _set_times(node: DriveNode, communication: int, notes: list[str]) -> None:
     """Neither inhibit time nor event timer: SYNC alone sets the pace."""
     for subindex, name in ((_INHIBIT_TIME, "inhibit time"), (_EVENT_TIMER, "event timer")):

@@ -59,7 +59,8 @@ ROW = np.dtype(
 #: Columns that the clock of the machine decides; all others are the same from run to run.
 TIMING_COLUMNS = ("sync_interval_s", "latency_s")
 
-_RECEIVED, _REMOTE, _ERROR, _EXTENDED = 1, 2, 4, 8
+#: Bits of a FRAME's flags.
+RECEIVED, REMOTE, ERROR, EXTENDED = 1, 2, 4, 8
 
 #: One frame on the bus, as the master saw or sent it.
 FRAME = np.dtype(
@@ -73,7 +74,8 @@ FRAME = np.dtype(
     align=True,
 )
 
-_HEADER = np.dtype(
+#: Heads and tails of both rings, and what they had no room for.
+HEADER = np.dtype(
     [
         ("row_head", "i8"),
         ("row_tail", "i8"),
@@ -96,7 +98,7 @@ class Ring:
     def __init__(self, descriptor: int) -> None:
         self.descriptor = descriptor
         self._memory = mmap.mmap(descriptor, self.size())
-        self.header = np.frombuffer(self._memory, _HEADER, 1)
+        self.header = np.frombuffer(self._memory, HEADER, 1)
         offset = self._offsets()
         self.rows = np.frombuffer(self._memory, ROW, ROWS, offset[0])
         self.frames = np.frombuffer(self._memory, FRAME, FRAMES, offset[1])
@@ -126,10 +128,10 @@ class Ring:
     def log_frame(self, time_s: float, message: can.Message, received: bool) -> None:
         """Note a frame (a `drive.FrameLog`)."""
         flags = (
-            _RECEIVED * received
-            | _REMOTE * message.is_remote_frame
-            | _ERROR * message.is_error_frame
-            | _EXTENDED * message.is_extended_id
+            RECEIVED * received
+            | REMOTE * message.is_remote_frame
+            | ERROR * message.is_error_frame
+            | EXTENDED * message.is_extended_id
         )
         put_frame(
             self.header,
@@ -166,14 +168,14 @@ class Ring:
 def to_message(frame: NDArray[np.void], channel: str) -> can.Message:
     """A FRAME as python-can's message."""
     flags, length = int(frame["flags"]), int(frame["length"])
-    remote = bool(flags & _REMOTE)
+    remote = bool(flags & REMOTE)
     return can.Message(
         timestamp=float(frame["time_s"]),
         arbitration_id=int(frame["can_id"]),
-        is_extended_id=bool(flags & _EXTENDED),
+        is_extended_id=bool(flags & EXTENDED),
         is_remote_frame=remote,
-        is_error_frame=bool(flags & _ERROR),
-        is_rx=bool(flags & _RECEIVED),
+        is_error_frame=bool(flags & ERROR),
+        is_rx=bool(flags & RECEIVED),
         dlc=length,
         data=None if remote else number_to_data(int(frame["data"]), length),
         channel=channel,

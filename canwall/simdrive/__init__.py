@@ -5,6 +5,7 @@ from canwall.simdrive.communication.dictionary import Dictionary
 from canwall.simdrive.communication.frame import Frame
 from canwall.simdrive.drive import SimulatedDrive
 from canwall.simdrive.faults import FaultyDrive
+from canwall.simdrive.loan import CompiledRunner
 from canwall.simdrive.mechanics.hand import hand_force
 from canwall.simdrive.mechanics.motion import ServoMotion
 from canwall.simdrive.mechanics.servo import (
@@ -23,6 +24,7 @@ __all__ = [
     "SERVO",
     "TORQUE_LIMITS",
     "BusRunner",
+    "CompiledRunner",
     "Device",
     "Dictionary",
     "FaultyDrive",

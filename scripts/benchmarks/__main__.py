@@ -15,6 +15,7 @@ from on_the_ball import ball, law_steps, planning_steps
 from on_the_bus import exchange, simulated_drive, whole_loop
 from on_the_clock import several_drives, sync_jitter
 from on_the_drive import endurance
+from on_the_socket import full_cycles, round_trip, under_python
 from ways_out import ways_out
 
 Benchmark: TypeAlias = Callable[[], dict[str, Any]]
@@ -25,6 +26,9 @@ BENCHMARKS: dict[str, Benchmark] = {
     "simulated_drive": simulated_drive,
     "several_drives": several_drives,
     "sync_jitter": sync_jitter,
+    "round_trip": round_trip,
+    "full_cycles": full_cycles,
+    "under_python": under_python,
     "law_steps": law_steps,
     "planning_steps": planning_steps,
     "ball": ball,

@@ -38,6 +38,17 @@ def test_all_is_well(rig: Rig) -> None:
     assert "cyclic synchronous torque (10)" in found(findings, "mode", "0x6060")
     assert found(findings, "units", "0x608F") == "131072 counts per turn of the shaft"
     assert found(findings, "PDO", "TPDO, with every SYNC").startswith("0x185: 0x6064:00 (32 bits)")
+    budget = [line.what for line in findings.lines if line.section == "bus budget"]
+    assert budget == [
+        "SYNC 0x080, 0 bytes",
+        "TPDO 0x185, 8 bytes",
+        "TPDO 0x385, 6 bytes",  # the dictionary has it on, whether the wall needs it or not
+        "RPDO 0x205, 4 bytes",
+        "cycle of 1 ms at 1000 kbit/s",
+    ]
+    # 55, 135, 115 and 95 bits.
+    assert found(findings, "bus budget", budget[-1]).startswith("40.0% used of 80%")
+    assert found(findings, "bus budget", budget[-1]).endswith("is 2000 Hz")
     assert found(findings, "watchdog", "set").startswith("RPDO event timer, 50 ms")
     assert "SWITCH ON DISABLED" in found(findings, "watchdog", "tested")
     assert "after the last sign of life" in found(findings, "watchdog", "tested")

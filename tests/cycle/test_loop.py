@@ -406,6 +406,9 @@ def test_energy_put_out_in_one_contact_ends_the_run(make_rig: RigFactory) -> Non
 # A bus that fails
 
 
+over_python_can = pytest.mark.parametrize("make_rig", ["python-can"], indirect=True)
+
+
 class FailingBus(VirtualBus):
     """Fails to send what `fails` picks."""
 
@@ -423,6 +426,7 @@ def failing_rig(make_rig: RigFactory) -> tuple[Rig, FailingBus]:
     return rig, rig.bus
 
 
+@over_python_can
 def test_bus_that_fails_once_is_left_in_order(make_rig: RigFactory) -> None:
     rig, bus = failing_rig(make_rig)
     loop = Loop(rig)
@@ -439,6 +443,7 @@ def test_bus_that_fails_once_is_left_in_order(make_rig: RigFactory) -> None:
     assert_ended_in_order(loop, outcome, loop.rows())
 
 
+@over_python_can
 @pytest.mark.parametrize("can_id", [SYNC, RPDO1])
 def test_cycle_that_fails_for_good_is_left_by_sdo(make_rig: RigFactory, can_id: int) -> None:
     rig, bus = failing_rig(make_rig)
@@ -459,6 +464,7 @@ def test_cycle_that_fails_for_good_is_left_by_sdo(make_rig: RigFactory, can_id: 
     assert rig.node.read(0x6071) == 0
 
 
+@over_python_can
 def test_bus_that_is_gone(make_rig: RigFactory) -> None:
     rig, bus = failing_rig(make_rig)
     loop = Loop(rig)
@@ -478,6 +484,7 @@ def test_bus_that_is_gone(make_rig: RigFactory) -> None:
     assert not any("\n" in trip for trip in outcome.trips)
 
 
+@over_python_can
 def test_bus_that_fails_at_the_very_first_frame(make_rig: RigFactory) -> None:
     rig, bus = failing_rig(make_rig)
     loop = Loop(rig)

@@ -4,7 +4,7 @@ import can
 import pytest
 from rig import SYNC, Loop, Rig, RigFactory, settings_with
 
-from canwall.cycle import ExternalSync, ProducedSync, PythonCanExchange
+from canwall.cycle import ExternalSync, ProducedSync
 from canwall.cycle.sync import SyncLostError
 from canwall.drive import Link
 
@@ -54,8 +54,7 @@ class Producer:
 def with_external_sync(rig: Rig) -> Loop:
     loop = Loop(rig)
     rig.frames.clear()
-    sync = ExternalSync(rig.link, SYNC, 0.001)
-    loop.exchange = PythonCanExchange(rig.link, [loop.axis], False, sync)
+    loop.exchange = loop.make_exchange(external_sync=True)
     return loop
 
 

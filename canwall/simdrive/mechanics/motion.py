@@ -39,6 +39,7 @@ class ServoMotion:
         self._first = self._elapsed
         hand = self._simulation.hand
         constant, slope = hand_force(hand, self._period_s, self._PIECE, self._first)
+        self._script = constant, slope
         self._constant, self._slope = constant.tolist(), slope.tolist()
 
     @property

@@ -1,0 +1,311 @@
+"""The native exchange: against a C program that only copies, against canopen, and under load."""
+
+import contextlib
+import itertools
+import os
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import canopen
+import numpy as np
+from numpy.typing import NDArray
+
+from canwall import config
+from canwall.cycle import (
+    Axis,
+    NativeExchange,
+    percentile_ns,
+    real_time_priority,
+    run_laws,
+    start_at,
+    step,
+)
+from canwall.drive import DriveNode, DriveSetup, Field, Link, PdoLayout
+from canwall.pair import PairBus
+from canwall.record import ROW, Phase, Ring
+from canwall.run import drive_dictionary, make_axis, make_exchange, on_the_bus, render
+from canwall.units import DriveUnits
+
+_SOURCE = Path(__file__).with_name("frames.c")
+_CYCLES = 4000
+_TURNS = 7
+_REAL_TIME_TURNS = 3
+_SIMULATED_S = 30.0
+#: What the C program's drive sends and takes.
+_TPDO = PdoLayout(
+    0x185, (Field(0x6064, 0, 0, 32), Field(0x6041, 0, 32, 16), Field(0x6077, 0, 48, 16))
+)
+_RPDO = PdoLayout(0x205, (Field(0x6040, 0, 0, 16), Field(0x6071, 0, 16, 16)))
+_COUNTS = 0x1000
+_names = itertools.count()
+
+
+@contextmanager
+def _program() -> Iterator[str]:
+    with tempfile.TemporaryDirectory() as folder:
+        program = f"{folder}/frames"
+        subprocess.run(["gcc", "-O2", "-o", program, str(_SOURCE)], check=True)
+        yield program
+
+
+def _against_drive(
+    program: str, master: Callable[[socket.socket], None]
+) -> tuple[NDArray[np.int64], float]:
+    """TPDO → RPDO as the drive sees it [ns], and the time of a cycle as it sees it [ns]."""
+    ours, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with ours, its:
+        drive = subprocess.Popen(
+            [program, str(its.fileno()), "drive", str(_CYCLES)],
+            pass_fds=[its.fileno()],
+            stdout=subprocess.PIPE,
+        )
+        try:
+            with contextlib.suppress(PermissionError):
+                # As prompt as a drive of its own: it waits for frames all the time.
+                policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+                os.sched_setscheduler(drive.pid, policy, os.sched_param(40))
+            master(ours)
+            out, _ = drive.communicate(timeout=60.0)
+        finally:
+            drive.kill()
+    numbers = np.frombuffer(out, np.int64)
+    return numbers[:-1], float(numbers[-1]) / _CYCLES
+
+
+def _axis(real_time: bool) -> Axis:
+    settings = config.load(
+        config.shipped("config/sim.toml"),
+        {
+            "wall.law": "mean_force",
+            "bus.pace": "real_time" if real_time else "simulated",
+            # What the machine does to a drive without a clock of its own ends no measurement.
+            "limits.hold_cycles": 100,
+            "limits.ramp_cycles": 1000,
+            "limits.late_cycles": 0,
+        },
+    )
+    setup = DriveSetup(DriveUnits(131072.0, 0.637), 0x080, _TPDO, _RPDO)
+    node = cast(DriveNode, SimpleNamespace(node_id=5, emergencies=[]))
+    axis = Axis(node, setup, settings, run_laws(settings), Ring.create())
+    axis.cycle["phase"], axis.cycle["controlword"] = Phase.RENDERING, 0x0F
+    start_at(axis.cycle, _COUNTS)
+    return axis
+
+
+def _c_master(program: str) -> Callable[[socket.socket], None]:
+    def master(sock: socket.socket) -> None:
+        subprocess.run(
+            [program, str(sock.fileno()), "master", str(_CYCLES)],
+            pass_fds=[sock.fileno()],
+            check=True,
+        )
+
+    return master
+
+
+def _native(real_time: bool, axis: Axis) -> Callable[[socket.socket], None]:
+    def master(sock: socket.socket) -> None:
+        bus = PairBus(sock.dup(), f"bench {next(_names)}")
+        link = Link(bus)
+        link.log = axis.ring.log_frame
+        exchange = NativeExchange(link, [axis], real_time)
+        exchange.ahead = 20 if real_time else 1000
+        while (j := int(axis.cycle["j"][0])) < _CYCLES:
+            exchange.cycle(min(exchange.ahead, _CYCLES - j))
+        sync_interval[:] = exchange.sync_interval
+        if axis.cycle["trip"][0]:
+            raise RuntimeError("the wall was given up")
+        bus.shutdown()
+
+    sync_interval = np.zeros(1, axis.latency.dtype)
+    master.sync_interval = sync_interval  # type: ignore[attr-defined]
+    return master
+
+
+def _the_usual_way(sock: socket.socket) -> None:
+    axis = _axis(False)
+    bus = PairBus(sock.dup(), f"bench {next(_names)}")
+    network = canopen.Network(bus)
+    node = network.add_node(5, str(axis.settings.drive.eds))
+    tpdo, rpdo = node.tpdo[1], node.rpdo[1]
+    for pdo, cob_id, objects in (
+        (tpdo, 0x185, (0x6064, 0x6041, 0x6077)),
+        (rpdo, 0x205, (0x6040, 0x6071)),
+    ):
+        pdo.clear()
+        for index in objects:
+            pdo.add_variable(index)
+        pdo.cob_id, pdo.enabled = cob_id, True
+    position, statusword, torque = tpdo
+    controlword, target = rpdo
+    row, sent = np.zeros(1, ROW), threading.Event()
+
+    def on_tpdo(_: object) -> None:
+        given = position.raw & 0xFFFFFFFF | statusword.raw << 32 | (torque.raw & 0x7FFF) << 48
+        answer = step(axis.cycle, row, given, True)
+        controlword.raw = answer & 0xFFFF
+        target.raw = (answer >> 16 & 0xFFFF ^ 0x8000) - 0x8000
+        rpdo.transmit()
+        sent.set()
+
+    tpdo.add_callback(on_tpdo)
+    tpdo.subscribe()
+    network.connect()
+    try:
+        for _ in range(_CYCLES):
+            sent.clear()
+            network.sync.transmit()
+            if not sent.wait(10.0):
+                raise RuntimeError("no RPDO came")
+    finally:
+        network.notifier.stop()
+        bus.shutdown()
+
+
+def _us(durations_ns: NDArray[np.int64], percent: float) -> float:
+    return round(float(np.percentile(durations_ns, percent)) / 1e3, 2)
+
+
+def round_trip() -> dict[str, Any]:
+    """TPDO → RPDO as the drive sees it, over a socket pair between processes, in turns.
+
+    The drive is the same C program for all; the masters are a C program that copies, the native
+    exchange (law, record and log included), and the usual way with canopen (neither).
+    """
+    turns = []
+    with _program() as program:
+        for _ in range(_TURNS):
+            turns.append(
+                (
+                    _against_drive(program, _c_master(program)),
+                    _against_drive(program, _native(False, _axis(False))),
+                    _against_drive(program, _the_usual_way),
+                )
+            )
+    c, ours, usual = (
+        np.concatenate([seen for seen, _ in each]) for each in zip(*turns, strict=True)
+    )
+    medians = [[float(np.median(seen)) for seen, _ in turn] for turn in turns]
+    cycles = [[cycle for _, cycle in turn] for turn in turns]
+    cycles_us = [round(statistics.median(each) / 1e3, 1) for each in zip(*cycles, strict=True)]
+    return {
+        "c_copy": {"p50_us": _us(c, 50), "p99_us": _us(c, 99)},
+        "native": {"p50_us": _us(ours, 50), "p99_us": _us(ours, 99)},
+        "usual_way": {"p50_us": _us(usual, 50), "p99_us": _us(usual, 99)},
+        "native_over_c": round(statistics.median(n / c for c, n, _ in medians), 3),
+        "aim_over_c": "<= 1.3",
+        "native_over_usual_way": round(statistics.median(n / u for _, n, u in medians), 3),
+        "aim_over_usual_way": "<= 0.1",
+        "repeats": [[round(n / c, 2), round(n / u, 3)] for c, n, u in medians],
+        "whole_cycle_us": dict(zip(("c_copy", "native", "usual_way"), cycles_us, strict=True)),
+        "whole_cycle_native_over_c": round(statistics.median(n / c for c, n, _ in cycles), 3),
+        "whole_cycle_native_over_usual_way": round(
+            statistics.median(n / u for _, n, u in cycles), 3
+        ),
+    }
+
+
+def full_cycles() -> dict[str, Any]:
+    """CANopen cycles per second in one thread over a socket pair: SYNC, TPDO, law, RPDO, drive."""
+    settings = config.load(
+        config.shipped("config/sim.toml"),
+        {"wall.law": "mean_force", "run.duration_s": _SIMULATED_S, "bus.exchange": "native"},
+    )
+    rates, of_processor = [], []
+    for _ in range(_TURNS):
+        with on_the_bus(settings) as link:
+            # Nobody reads the ring: what it has no room for is counted as lost.
+            axis = make_axis(
+                link, settings, drive_dictionary(settings), run_laws(settings), Ring.create()
+            )
+            link.log = axis.ring.log_frame
+            exchange = make_exchange(link, [axis])
+            exchange.waits_for_writer = False
+            begin, begin_cpu = time.perf_counter(), time.process_time()
+            outcome = render(exchange, stop=lambda: False)
+            rates.append(outcome.cycles / (time.perf_counter() - begin))
+            of_processor.append(outcome.cycles / (time.process_time() - begin_cpu))
+            if outcome.trips:
+                raise RuntimeError("; ".join(outcome.trips))
+    return {
+        "cycles_per_s": round(statistics.median(rates)),
+        "best": round(max(rates)),
+        "cycles_per_processor_s": round(statistics.median(of_processor)),
+        "aim": ">= 50000",
+        "repeats": [round(rate) for rate in rates],
+    }
+
+
+@contextmanager
+def _python_threads() -> Iterator[None]:
+    """One thread that computes, one that makes garbage, in this process."""
+    over = threading.Event()
+
+    def compute() -> None:
+        while not over.is_set():
+            sum(range(100))
+
+    def litter() -> None:
+        while not over.is_set():
+            rings: list[Any] = [[k] for k in range(100)]
+            for ring in rings:
+                ring.append(ring)
+
+    threads = [threading.Thread(target=work) for work in (compute, litter)]
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-4)
+    for thread in threads:
+        thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        for thread in threads:
+            thread.join()
+        sys.setswitchinterval(interval)
+
+
+def under_python() -> dict[str, Any]:
+    """TPDO → RPDO at 1 kHz in real time, with and without Python threads that hold the lock."""
+
+    def measured() -> dict[str, float]:
+        axis = _axis(True)
+        master = _native(True, axis)
+        with real_time_priority():
+            seen, _ = _against_drive(program, master)
+        intervals = master.sync_interval  # type: ignore[attr-defined]
+        return {
+            "p99.9_us": percentile_ns(axis.latency, 99.9) / 1e3,
+            "drive_p99.9_us": _us(seen, 99.9),
+            "sync_p99_us": percentile_ns(intervals, 99) / 1e3,
+            "late": axis.late_rpdo,
+        }
+
+    turns = []
+    with real_time_priority() as granted:
+        pass
+    with _program() as program:
+        for _ in range(_REAL_TIME_TURNS):
+            idle = measured()
+            with _python_threads():
+                turns.append((idle, measured()))
+    ratios = [loaded["p99.9_us"] / idle["p99.9_us"] for idle, loaded in turns]
+    names = list(turns[0][0])
+    return {
+        "scheduling": granted,
+        "idle": {n: round(statistics.median(idle[n] for idle, _ in turns), 2) for n in names},
+        "loaded": {n: round(statistics.median(busy[n] for _, busy in turns), 2) for n in names},
+        "ratio": round(statistics.median(ratios), 2),
+        "aim": "<= 2",
+        "repeats": [round(ratio, 2) for ratio in ratios],
+    }
