@@ -29,7 +29,7 @@ from canwall.cycle import (
     Outcome,
     PythonCanExchange,
     Watch,
-    real_time_priority,
+    real_time_machine,
     run_laws,
     run_loop,
     timing_summary,
@@ -319,11 +319,11 @@ def restored() -> Iterator[tuple[list[Axis], dict[str, list[str]]]]:
                 left[axis.name] = axis.node.restore()
 
 
-def scheduled(settings: Settings) -> AbstractContextManager[str]:
-    """Real-time priority for a run that keeps to the clock; tells what was granted."""
+def scheduled(settings: Settings) -> AbstractContextManager[dict[str, str]]:
+    """The machine's set-up for a run that keeps to the clock; tells what was granted."""
     if settings.real_time:
-        return real_time_priority()
-    return nullcontext("simulated time")
+        return real_time_machine(settings.bus.processor)
+    return nullcontext({"scheduling": "simulated time"})
 
 
 def _check_together(many: Sequence[Settings]) -> None:
@@ -351,7 +351,7 @@ def _result(
     axis: Axis,
     exchange: Exchange,
     watch: Watch,
-    scheduling: str,
+    scheduling: dict[str, str],
     folder: RunFolder,
     outcome: Outcome,
     notes: list[str],
@@ -374,7 +374,7 @@ def _result(
         "drive": _described(axis.setup),
         "timing": {
             "exchange": exchange.name,
-            "scheduling": scheduling,
+            **scheduling,
             "sync_interval": timing_summary(exchange.sync_interval),
             "tpdo_to_rpdo": timing_summary(axis.latency),
         },

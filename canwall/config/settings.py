@@ -21,6 +21,7 @@ class Bus(Section):
     pace: Literal["auto", "real_time", "simulated"] = "auto"
     sync: Literal["produce", "external"] = "produce"
     exchange: Literal["auto", "python-can", "native"] = "auto"
+    processor: Annotated[int, Field(ge=0, le=4095)] | None = None
     master_id: int = Field(127, ge=1, le=127)
 
 

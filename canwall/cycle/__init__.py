@@ -5,6 +5,7 @@ from canwall.cycle.delay import measured_delay
 from canwall.cycle.exchange import Exchange, PythonCanExchange
 from canwall.cycle.laws import run_laws
 from canwall.cycle.loop import Outcome, run_loop
+from canwall.cycle.machine import real_time_machine
 from canwall.cycle.native import NativeExchange
 from canwall.cycle.realtime import real_time_priority
 from canwall.cycle.step import (
@@ -40,6 +41,7 @@ __all__ = [
     "measured_delay",
     "observe_ns",
     "percentile_ns",
+    "real_time_machine",
     "real_time_priority",
     "run_laws",
     "run_loop",

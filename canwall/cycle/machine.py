@@ -1,0 +1,95 @@
+"""What the machine does for a cycle that keeps to the clock, where the process may have it.
+
+Besides the priority of the loop's thread (`realtime`): memory that stays in RAM, processors that
+do not fall asleep deeply, a processor to stay on, and other Python threads that let go soon.
+"""
+
+import ctypes
+import os
+import struct
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from canwall.cycle.realtime import real_time_priority
+
+#: sys/mman.h. Only pages that are used are locked: libraries map far more than they touch.
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+#: Whoever holds this file open limits the time that a processor may take to wake up.
+_WAKE_UP = Path("/dev/cpu_dma_latency")
+#: How soon another Python thread gives the interpreter back between two looks of the loop [s].
+_SWITCH_INTERVAL_S = 1e-4
+
+
+@contextmanager
+def real_time_machine(processor: int | None = None) -> Iterator[dict[str, str]]:
+    """Everything that the process may have; tells what was granted, and how to get the rest.
+
+    `processor`: the one that the loop's thread is to stay on; it may be one that is kept free of
+    others (isolcpus). All is put back at the end.
+    """
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(min(interval, _SWITCH_INTERVAL_S))
+    try:
+        with (
+            real_time_priority() as scheduling,
+            _memory_locked() as memory,
+            _awake() as wake_up,
+            _on_processor(processor) as processors,
+        ):
+            yield {
+                "scheduling": scheduling,
+                "memory": memory,
+                "wake_up": wake_up,
+                "processor": processors,
+            }
+    finally:
+        sys.setswitchinterval(interval)
+
+
+@contextmanager
+def _memory_locked() -> Iterator[str]:
+    library = ctypes.CDLL(None, use_errno=True)
+    if library.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) != 0:
+        yield (
+            f"not locked ({os.strerror(ctypes.get_errno())}): allow it in "
+            "/etc/security/limits.conf: '@realtime - memlock unlimited' for a group that you are in"
+        )
+        return
+    try:
+        yield "locked"
+    finally:
+        library.munlockall()
+
+
+@contextmanager
+def _awake() -> Iterator[str]:
+    try:
+        file = _WAKE_UP.open("wb", buffering=0)
+    except OSError as error:
+        yield (
+            f"processors may sleep deeply ({_WAKE_UP}: {error.strerror}): let a group that you are "
+            "in write to it"
+        )
+        return
+    with file:
+        file.write(struct.pack("=i", 0))
+        yield "processors stay awake"
+
+
+@contextmanager
+def _on_processor(processor: int | None) -> Iterator[str]:
+    before = os.sched_getaffinity(0)
+    if processor is None:
+        yield f"any of {len(before)}"
+        return
+    try:
+        os.sched_setaffinity(0, {processor})
+    except OSError as error:
+        yield f"any of {len(before)}: bus.processor = {processor}: {error.strerror}"
+        return
+    try:
+        yield f"number {processor}"
+    finally:
+        os.sched_setaffinity(0, before)
