@@ -57,7 +57,6 @@ OPERATORS = {
 
 _PRESSING_NM = 0.15
 _FIRST_STRIKE_S = 0.05
-_START_RAD = 0.03
 _AFTERWARDS_S = 0.25
 #: Cycles of rest between enabling and the strike: at 100 Hz the above is no time for it.
 _AT_REST_CYCLES = 3
@@ -87,17 +86,20 @@ def model_of(settings: Settings, knows: str, error: float) -> Mechanics:
     return model.model_copy(update={"inertia_kg_m2": model.inertia_kg_m2 * (1.0 + error)})
 
 
-def struck(settings: Settings, speed_rad_s: float, phase: float, press_s: float) -> Settings:
+def struck(
+    settings: Settings, speed_rad_s: float, phase: float, start_rad: float, press_s: float
+) -> Settings:
     """The configuration's operator strikes the wall once, pressing with 0.15 N·m for press_s.
 
-    speed_rad_s is the mean speed of the hand's approach; phase, 0 … 1, shifts the start by that
-    share of the way of one period, and with it the instant of contact against the SYNC.
+    speed_rad_s is the mean speed of the hand's approach from start_rad off the wall; phase,
+    0 … 1, shifts the start by that share of the way of one period, and with it the instant of
+    contact against the SYNC.
     """
     simulation, period = settings.simulation, settings.bus.cycle_s
     assert simulation is not None
     sign = 1.0 if settings.wall.side == "below" else -1.0
     wall = settings.wall.position_rad
-    start = _START_RAD + phase * speed_rad_s * period
+    start = start_rad + phase * speed_rad_s * period
     stiffness = simulation.hand.stiffness_nm_per_rad
     # A hand with a spring presses by it; without one, by its muscle torque alone.
     depth = _PRESSING_NM / stiffness if stiffness > 0.0 else 0.0
