@@ -168,14 +168,15 @@ class Strike:
             signals = self._loop.signals(stiffness, damping)
         referent = self._referent.positions(
             np.full(self._cycles, stiffness), np.full(self._cycles, damping), self._origin
-        )[ENABLING_CYCLES:]
+        )
         found = np.zeros(1, MEASURES)
         measure(
             signals.y,
             signals.force,
             signals.torque,
             signals.trip,
-            referent[: len(signals.y)],
+            signals.trip != 0 and not self._leaves(referent),
+            referent[ENABLING_CYCLES : ENABLING_CYCLES + len(signals.y)],
             self.period,
             self._loop.units.rad_per_count,
             self._loop.units.nm_per_mille,
@@ -183,6 +184,19 @@ class Strike:
             found,
         )
         return found[0]
+
+    def _leaves(self, referent: Array) -> bool:
+        """Whether the referent itself passes the limits that end a run.
+
+        A soft wall gives way that far, and a stiff one gives back what was put into it.
+        """
+        wall, limits = self._settings.wall, self._settings.limits
+        sign = 1.0 if wall.side == "below" else -1.0
+        position = wall.position_rad + sign * referent
+        low, high = limits.position_rad
+        fastest = np.abs(np.diff(referent)).max(initial=0.0) / self.period
+        within = low <= position.min() and position.max() <= high and fastest <= limits.speed_rad_s
+        return not within
 
 
 def signals_over_bus(settings: Settings) -> Signals:
