@@ -255,7 +255,7 @@ def sweep(
         typer.Option(
             metavar="NAME=VALUES",
             help="Any other axis: a key of the configuration, or delay, counts, torque_step, "
-            "model, model_error, servo, speed, phase, press, stiffness_normalised, "
+            "model, model_error, servo, speed, phase, start, press, stiffness_normalised, "
             "damping_normalised; VALUES: A,B,C or LO:HI:N.",
         ),
     ] = None,
@@ -289,7 +289,7 @@ def sweep(
         try:
             dataset = swept(plan, output, resume, workers, dask, partial(shown.count, "sweeping"))
         except KeyboardInterrupt:
-            raise _Interrupted(f"interrupted; --resume goes on with {output}") from None
+            raise _InterruptedError(f"interrupted; --resume goes on with {output}") from None
     if "worst" in dataset:
         _console.print(_limit_table(dataset))
     _console.print(f"{plan.points_in_all} points: {output}", soft_wrap=True, highlight=False)
@@ -317,9 +317,18 @@ def _limit_table(dataset: "xr.Dataset") -> Table:
 
 @app.command()
 def plot(
-    what: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")],
+    what: Annotated[
+        Path, typer.Argument(metavar="DIR|FILE.nc", help="Folder of a run, or result of a sweep.")
+    ],
 ) -> int:
     """Draw the picture of a recorded run again, or the figures of a sweep."""
+    if what.suffix == ".nc":
+        from canwall.sweep import read_sweep
+        from canwall.sweep.figures import write_sweep_figures
+
+        for picture in write_sweep_figures(read_sweep(what), what.with_suffix("")):
+            _console.print(str(picture), soft_wrap=True, highlight=False)
+        return 0
     from canwall.plots import plot_run
     from canwall.record import RunFolder
 
@@ -473,7 +482,7 @@ def _strike_table(strikes: list[dict[str, Any]]) -> Table:
     return table
 
 
-class _Interrupted(KeyboardInterrupt):
+class _InterruptedError(Exception):
     """Ctrl-C, and what to say of it."""
 
 
@@ -490,7 +499,7 @@ def _guarded(command: Callable[[], object]) -> int:
     """Every error as one line; a traceback is a bug."""
     try:
         result = command()
-    except _Interrupted as interrupted:
+    except _InterruptedError as interrupted:
         _error(str(interrupted))
         return INTERRUPTED
     except (KeyboardInterrupt, typer.Abort):

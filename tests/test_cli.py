@@ -81,7 +81,7 @@ def test_help() -> None:
     [
         ("run", ["CONFIG", "--law", "--stiffness", "--damping", "--duration", "--output"]),
         ("drive", ["CONFIG"]),
-        ("plot", ["DIR"]),
+        ("plot", ["DIR|FILE.nc"]),
     ],
 )
 def test_help_of_a_command(say: Say, name: str, words: list[str]) -> None:
@@ -99,7 +99,7 @@ def test_help_of_a_command(say: Say, name: str, words: list[str]) -> None:
         (["run", "--stiffness", "soft"], "Invalid value for '--stiffness'"),
         (["drive", "one.toml", "two.toml"], "Got unexpected extra argument"),
         (["run", "one.toml", "two.toml"], "one.toml: no such file"),
-        (["plot"], "Missing argument 'DIR'"),
+        (["plot"], "Missing argument 'DIR|FILE.nc'"),
     ],
 )
 def test_bad_usage(say: Say, arguments: list[str], line: str) -> None:

@@ -35,6 +35,7 @@ NAMED = {
     "servo": ("", "file: as configured; ideal: no cogging, any torque, at once"),
     "speed": ("rad/s", "mean speed of the hand's approach"),
     "phase": ("1", "phase of the contact against the SYNC"),
+    "start": ("rad", "how far from the wall the handle rests before"),
     "press": ("s", "how long the hand presses"),
 }
 #: Axes of the wall itself: a strike prepared once meets all of their values.
@@ -47,6 +48,7 @@ DEFAULTS: dict[str, tuple[Value, ...]] = {
     "model": ("matched",),
     "model_error": (0.0,),
     "servo": ("file",),
+    "start": (0.03,),
     "press": (0.6,),
     "speed": (0.5, 1.0, 2.0),
     "phase": (0.0, 0.35, 0.7),
@@ -166,7 +168,8 @@ def resolve(base: Settings, point: Point) -> Settings:
         settings = settings.model_copy(
             update={"estimator": settings.estimator.model_copy(update=known)}
         )
-    return struck(settings, float(values["speed"]), float(values["phase"]), float(values["press"]))
+    speed, phase, start, press = (float(values[n]) for n in ("speed", "phase", "start", "press"))
+    return struck(settings, speed, phase, start, press)
 
 
 def _of_the_model(key: str) -> bool:

@@ -25,6 +25,7 @@ _LIMITS = {
 _CIRCUMSTANCES = {
     "inertia": ("kg*m^2", "of what really moves"),
     "viscous": ("N*m*s/rad", "damping of what really moves"),
+    "device_viscous": ("N*m*s/rad", "damping of the drive and the handle alone"),
     "coulomb": ("N*m", "Coulomb friction"),
     "period": ("s", "T"),
     "loop_delay": ("1", "D in cycles"),
@@ -118,6 +119,7 @@ def _circumstances(plan: Plan, point: Mapping[str, Any]) -> tuple[float, ...]:
     return (
         simulation.inertia_kg_m2 + hand.inertia_kg_m2,
         simulation.viscous_nm_s_per_rad + hand.damping_nm_s_per_rad,
+        simulation.viscous_nm_s_per_rad,
         simulation.coulomb_nm,
         settings.bus.cycle_s,
         loop_delay(settings),

@@ -57,19 +57,32 @@ def _is_free(strike: Strike, unit: float, damping: float, normalised: float) -> 
 def bracket(is_free: Callable[[float], bool]) -> tuple[float, float]:
     """(the largest that is free, one that is not) no further apart than RESOLUTION in the log.
 
-    Goes up by factors of two from FIRST until one is not free, down where the first is not.
-    (0, …) where none is free down to SMALLEST, (…, inf) where all are up to LARGEST.
+    Goes up by factors of two from FIRST until one is not free. Where the first is not, goes down;
+    and where none is down there (a soft wall may be too soft to hold the hand), up to one that
+    is. (0, …) where none is free at all, (…, inf) where all are from there to LARGEST.
     """
-    free, taken, at = 0.0, math.inf, FIRST
-    while SMALLEST <= at <= LARGEST:
+    steps = math.floor(math.log2(LARGEST / FIRST))
+    up = [FIRST * 2.0**n for n in range(steps + 1)]
+    down = [FIRST * 0.5**n for n in range(1, math.floor(math.log2(FIRST / SMALLEST)) + 1)]
+    free, taken = 0.0, math.inf
+    if not is_free(up[0]):
+        taken = up.pop(0)
+        for at in down:
+            if is_free(at):
+                free = at
+                break
+            taken = at
+    if free == 0.0:
+        for at in up:
+            if is_free(at):
+                free, taken = at, math.inf
+            elif free > 0.0:
+                taken = at
+                break
+    while free > 0.0 and math.isfinite(taken) and math.log(taken / free) >= RESOLUTION:
+        at = math.sqrt(free * taken)
         if is_free(at):
             free = at
         else:
             taken = at
-        if free > 0.0 and taken < math.inf:
-            if math.log(taken / free) < RESOLUTION:
-                break
-            at = math.sqrt(free * taken)
-        else:
-            at *= 2.0 if free > 0.0 else 0.5
     return free, taken

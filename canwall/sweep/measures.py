@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 #: One strike, judged. What cannot be told is NaN.
 MEASURES = np.dtype(
     [
-        ("chatters", "?"),  # or tripped: its wall threw the handle away
+        ("chatters", "?"),  # or threw the handle away
         ("settled", "?"),  # whether the referent settles, so that the amplitude can be judged
         ("trip", "i1"),  # cycle.Trip
         ("contacts", "i4"),
@@ -38,7 +38,10 @@ MEASURES = np.dtype(
 
 #: (unit, what it is) of the measures that are numbers.
 DESCRIBED = {
-    "chatters": ("1", "chatter by the definition of theory.md section 5, or a trip"),
+    "chatters": (
+        "1",
+        "chatter by theory, section 5, or a trip where the referent stays within the limits",
+    ),
     "settled": ("1", "the referent settles, so that the amplitude is judged"),
     "trip": ("1", "the limit that ended the strike (cycle.Trip), 0: none"),
     "contacts": ("1", "contacts of the strike"),
@@ -69,6 +72,7 @@ def measure(
     force: Array,
     torque: Array,
     trip: int,
+    thrown: bool,
     referent: Array,
     period: float,
     count: float,
@@ -78,7 +82,8 @@ def measure(
 ) -> None:
     """Judge one strike into found[0], dtype MEASURES.
 
-    y, force, torque and referent have shape (n,); count is Δ [rad], torque_step f_LSB [N·m].
+    y, force, torque and referent have shape (n,); thrown says that a trip is the wall's doing,
+    its referent's would have stayed within the limits; count is Δ [rad], torque_step f_LSB [N·m].
     """
     into: Record = found[0]
     window = metrics.event_window(period)
@@ -92,7 +97,7 @@ def measure(
     into.motion = metrics.peak_to_peak(y[start:stop])
     into.referent_motion = metrics.peak_to_peak(referent[start:stop])
     into.chatters = (
-        trip != 0
+        thrown
         or into.events - into.referent_events >= metrics.EVENTS_OF_CHATTER
         or into.motion - into.referent_motion > tolerance
     )

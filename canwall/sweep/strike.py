@@ -57,7 +57,6 @@ OPERATORS = {
 
 _PRESSING_NM = 0.15
 _FIRST_STRIKE_S = 0.05
-_START_RAD = 0.03
 _AFTERWARDS_S = 0.25
 #: Cycles of rest between enabling and the strike: at 100 Hz the above is no time for it.
 _AT_REST_CYCLES = 3
@@ -87,17 +86,20 @@ def model_of(settings: Settings, knows: str, error: float) -> Mechanics:
     return model.model_copy(update={"inertia_kg_m2": model.inertia_kg_m2 * (1.0 + error)})
 
 
-def struck(settings: Settings, speed_rad_s: float, phase: float, press_s: float) -> Settings:
+def struck(
+    settings: Settings, speed_rad_s: float, phase: float, start_rad: float, press_s: float
+) -> Settings:
     """The configuration's operator strikes the wall once, pressing with 0.15 N·m for press_s.
 
-    speed_rad_s is the mean speed of the hand's approach; phase, 0 … 1, shifts the start by that
-    share of the way of one period, and with it the instant of contact against the SYNC.
+    speed_rad_s is the mean speed of the hand's approach from start_rad off the wall; phase,
+    0 … 1, shifts the start by that share of the way of one period, and with it the instant of
+    contact against the SYNC.
     """
     simulation, period = settings.simulation, settings.bus.cycle_s
     assert simulation is not None
     sign = 1.0 if settings.wall.side == "below" else -1.0
     wall = settings.wall.position_rad
-    start = _START_RAD + phase * speed_rad_s * period
+    start = start_rad + phase * speed_rad_s * period
     stiffness = simulation.hand.stiffness_nm_per_rad
     # A hand with a spring presses by it; without one, by its muscle torque alone.
     depth = _PRESSING_NM / stiffness if stiffness > 0.0 else 0.0
@@ -166,14 +168,15 @@ class Strike:
             signals = self._loop.signals(stiffness, damping)
         referent = self._referent.positions(
             np.full(self._cycles, stiffness), np.full(self._cycles, damping), self._origin
-        )[ENABLING_CYCLES:]
+        )
         found = np.zeros(1, MEASURES)
         measure(
             signals.y,
             signals.force,
             signals.torque,
             signals.trip,
-            referent[: len(signals.y)],
+            signals.trip != 0 and not self._leaves(referent),
+            referent[ENABLING_CYCLES : ENABLING_CYCLES + len(signals.y)],
             self.period,
             self._loop.units.rad_per_count,
             self._loop.units.nm_per_mille,
@@ -181,6 +184,19 @@ class Strike:
             found,
         )
         return found[0]
+
+    def _leaves(self, referent: Array) -> bool:
+        """Whether the referent itself passes the limits that end a run.
+
+        A soft wall gives way that far, and a stiff one gives back what was put into it.
+        """
+        wall, limits = self._settings.wall, self._settings.limits
+        sign = 1.0 if wall.side == "below" else -1.0
+        position = wall.position_rad + sign * referent
+        low, high = limits.position_rad
+        fastest = np.abs(np.diff(referent)).max(initial=0.0) / self.period
+        within = low <= position.min() and position.max() <= high and fastest <= limits.speed_rad_s
+        return not within
 
 
 def signals_over_bus(settings: Settings) -> Signals:

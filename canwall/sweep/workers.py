@@ -69,7 +69,7 @@ def _on_a_cluster(plan: Plan, pieces: Sequence[int], address: str) -> Iterator[F
             client.submit(compute, plan, piece, pure=False, retries=2): piece for piece in pieces
         }
         try:
-            for job in distributed.as_completed(list(jobs)):
+            for job in distributed.as_completed(list(jobs), loop=client.loop):
                 yield jobs[job], job.result()
                 job.release()
         except distributed.KilledWorker as error:

@@ -16,6 +16,7 @@ from on_the_bus import exchange, simulated_drive, whole_loop
 from on_the_clock import several_drives, sync_jitter
 from on_the_drive import endurance
 from on_the_socket import full_cycles, round_trip, under_python
+from on_the_sweep import closed_loop, sweep_on_two_cores
 from ways_out import ways_out
 
 Benchmark: TypeAlias = Callable[[], dict[str, Any]]
@@ -32,6 +33,8 @@ BENCHMARKS: dict[str, Benchmark] = {
     "law_steps": law_steps,
     "planning_steps": planning_steps,
     "ball": ball,
+    "closed_loop": closed_loop,
+    "sweep_on_two_cores": sweep_on_two_cores,
 }
 ON_REQUEST: dict[str, Benchmark] = {"endurance": endurance, "ways_out": ways_out}
 """Minutes each, so they are run when they are named."""

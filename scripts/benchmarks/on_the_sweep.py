@@ -1,0 +1,115 @@
+"""The sweep in memory: closed-loop periods per second, against plain Python, on two cores."""
+
+import os
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from canwall import config
+from canwall.sweep import make_plan
+from canwall.sweep.closed_loop import ClosedLoop
+from canwall.sweep.plan import Plan
+from canwall.sweep.workers import computed
+
+#: Periods of one strike.
+_STRIKE = 1000
+
+
+def _plan(**axes: Any) -> Plan:
+    base = config.load(config.shipped("config/sim.toml"))
+    return make_plan(base, {"servo": "ideal", "operator": "finger", **axes})
+
+
+def _seconds(work: Callable[[], object], repeats: int = 5) -> float:
+    taken = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        work()
+        taken.append(time.perf_counter() - start)
+    return statistics.median(taken)
+
+
+def closed_loop() -> dict[str, Any]:
+    """Periods per second and core: plant with friction, encoder, estimator, law."""
+    found = {}
+    for law in ("standard", "half_sample", "mean_force", "push_only"):
+        one = ClosedLoop(_struck(law), _STRIKE)
+        one.signals(50.0, 0.0)
+        found[law] = round(
+            100 * _STRIKE / _seconds(lambda one=one: [one.signals(50.0, 0.0) for _ in range(100)])  # type: ignore[misc]
+        )
+    plain = _STRIKE / _seconds(_plain_strike, 3)
+    return {
+        "periods_per_s": found,
+        "plain_python_periods_per_s": round(plain),
+        "half_sample_over_plain_python": round(found["half_sample"] / plain, 1),
+    }
+
+
+def _struck(law: str) -> Any:
+    plan = _plan(law=law, stiffness=[50.0], speed=[1.0], phase=[0.0])
+    return plan.settings(plan.points[0], plan.strikes[0])
+
+
+def _plain_strike() -> None:
+    """The same loop as it is written in NumPy: matrices, a Kalman filter, half_sample."""
+    from scipy.linalg import expm
+
+    from canwall.walls.estimator import kalman_gain
+
+    settings = _struck("half_sample")
+    mechanics, period = settings.mechanics, settings.bus.cycle_s
+    mass, viscous = mechanics.inertia_kg_m2, mechanics.viscous_nm_s_per_rad
+    count, step, stiffness = 2.0 * np.pi / 131072, 0.637e-3, 50.0
+    hand = settings.simulation.hand.stiffness_nm_per_rad
+    model = np.array([[0.0, 1.0, 0.0], [0.0, -viscous / mass, 1.0 / mass], [0.0, 0.0, 0.0]])
+    plant = model.copy()
+    plant[1, 0] = -hand / mass
+    flow, moves = expm(model * period), expm(plant * period)
+    phi, gamma = flow[:2, :2], flow[:2, 2]
+    contact = np.array([[0.0, 1.0], [-stiffness / mass, -viscous / mass]])
+    half = expm(contact * 0.5 * period)
+    gain = kalman_gain(mass, viscous, 0.0, period, count, 0.2)
+    x, estimate, sent = np.array([0.03, 0.0]), np.array([0.03, 0.0, 0.0]), 0.0
+    for j in range(_STRIKE):
+        y = np.floor(x[0] / count + 0.5) * count
+        estimate = estimate + gain * (y - estimate[0])
+        friction = np.clip(mass * estimate[1] / period, -0.01, 0.01)
+        at = phi @ estimate[:2] + gamma * (sent + estimate[2] - friction)
+        force = -stiffness * (half @ at)[0] if at[0] < 0.0 else 0.0
+        force = np.clip(np.rint(force / step), -2983, 2983) * step
+        friction = np.clip(mass * x[1] / period, -0.01, 0.01)
+        push = -0.15 if 50 < j < 750 else 0.0
+        x = moves @ np.array([x[0], x[1], sent + push - friction])
+        x = x[:2]
+        estimate[:2] = at
+        sent = force
+
+
+def sweep_on_two_cores() -> dict[str, Any]:
+    """The same map on one core and on two, and points per second of a Z-width map."""
+    plan = _plan(
+        law="half_sample",
+        stiffness="1:300:60",
+        damping="0:0.05:20",
+        speed=[0.5, 1.0],
+        phase=[0.0],
+        press=1.1,
+    )
+    pieces = range(plan.pieces)
+    list(computed(plan, pieces[:2], 1))
+    one = _seconds(lambda: list(computed(plan, pieces, 1)), 3)
+    two = _seconds(lambda: list(computed(plan, pieces, 2)), 3)
+    return {
+        "points": plan.points_in_all,
+        "periods": round(
+            plan.points_in_all * plan.settings(plan.points[0], plan.strikes[1]).run.duration_s * 1e3  # type: ignore[operator]
+        ),
+        "one_core_s": round(one, 2),
+        "two_cores_s": round(two, 2),
+        "two_cores_over_one": round(one / two, 2),
+        "processors": len(os.sched_getaffinity(0)),
+    }

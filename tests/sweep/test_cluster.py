@@ -1,0 +1,140 @@
+"""Sweeps on a Dask cluster, and what a killed worker and Ctrl-C leave of them."""
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from commands import COMMAND, command
+from rig import SIM_CONFIG
+
+from canwall.sweep import read_sweep
+
+PATIENCE_S = 120.0
+
+#: Some ten seconds's work for one core: there is time to kill somebody.
+SWEEP = [
+    *("sweep", SIM_CONFIG, "--law", "push_only", "--operator", "finger"),
+    *("--stiffness", "1:300:240", "--axis", "speed=0.5,0.7,1,1.4,2", "--axis", "phase=0:0.75:4"),
+]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = tmp_path_factory.mktemp("whole") / "whole.nc"
+    done = command(*SWEEP, "--output", output)
+    assert (done.returncode, done.stderr) == (0, "")
+    return output
+
+
+class Cluster:
+    """A scheduler and two workers, processes of their own on this machine."""
+
+    def __init__(self, folder: Path) -> None:
+        self.workers: list[subprocess.Popen[bytes]] = []
+        self._log = (folder / "log").open("wb")
+        file = folder / "scheduler.json"
+        self._scheduler = self._start(
+            "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
+            "--scheduler-file", str(file),
+        )  # fmt: skip
+        deadline = time.monotonic() + PATIENCE_S
+        while not file.exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        self.scheduler_file = file
+        self.workers = [
+            self._start(
+                "worker", "--scheduler-file", str(file), "--nthreads", "1", "--no-nanny",
+                "--no-dashboard", "--local-directory", str(folder),
+            )
+            for _ in range(2)
+        ]  # fmt: skip
+
+    def _start(self, *arguments: str) -> "subprocess.Popen[bytes]":
+        return subprocess.Popen(
+            [str(Path(COMMAND).with_name("dask")), *arguments],
+            stdout=self._log,
+            stderr=self._log,
+        )
+
+    @property
+    def address(self) -> str:
+        import json
+
+        return str(json.loads(self.scheduler_file.read_text())["address"])
+
+    def close(self) -> None:
+        for process in (*self.workers, self._scheduler):
+            process.kill()
+            process.wait()
+        self._log.close()
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[Cluster]:
+    folder = tmp_path / "cluster"
+    folder.mkdir()
+    started = Cluster(folder)
+    yield started
+    started.close()
+
+
+def wait_for_pieces(output: Path, process: "subprocess.Popen[str]") -> None:
+    """Until some of the sweep is on disk, and not all of it."""
+    import sqlite3
+
+    journal = output.with_name(output.name + ".partial")
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        assert process.poll() is None, process.communicate()[1]
+        if journal.exists():
+            # The sweep holds the file for itself; that it grows shows that pieces come.
+            try:
+                with sqlite3.connect(f"file:{journal}?mode=ro&immutable=1", uri=True) as base:
+                    if base.execute("SELECT count(*) FROM pieces").fetchone()[0] >= 3:
+                        return
+            except sqlite3.Error:
+                pass
+        time.sleep(0.02)
+    raise AssertionError("no pieces came")
+
+
+def started(*arguments: object) -> "subprocess.Popen[str]":
+    return subprocess.Popen(
+        [COMMAND, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def test_a_worker_that_is_killed_loses_nothing_but_time(
+    cluster: Cluster, whole: Path, tmp_path: Path
+) -> None:
+    output = tmp_path / "clustered.nc"
+    process = started(*SWEEP, "--output", output, "--dask", cluster.address)
+    wait_for_pieces(output, process)
+    cluster.workers[0].kill()
+    _, errors = process.communicate(timeout=PATIENCE_S)
+    assert (process.returncode, errors) == (0, "")
+    assert cluster.workers[0].poll() == -signal.SIGKILL
+    assert read_sweep(output).identical(read_sweep(whole))
+
+
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
+def test_what_was_interrupted_goes_on(whole: Path, tmp_path: Path, end: signal.Signals) -> None:
+    output = tmp_path / "a.nc"
+    process = started(*SWEEP, "--output", output, "--workers", 1)
+    wait_for_pieces(output, process)
+    os.kill(process.pid, end)
+    _, errors = process.communicate(timeout=PATIENCE_S)
+    if end == signal.SIGINT:
+        assert process.returncode == 130
+        assert errors == f"canwall: interrupted; --resume goes on with {output}\n"
+    assert not output.exists()
+    assert command(*SWEEP, "--output", output).returncode == 2
+    done = command(*SWEEP, "--output", output, "--resume", "--workers", 2)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert read_sweep(output).identical(read_sweep(whole))
+    assert [path.name for path in tmp_path.iterdir()] == ["a.nc"]
