@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from commands import Record
+from rig import Loop, Rig, settings_with
 from socketcan import PATIENCE_S, Bench, Canwall, has_socketcan, is_up, wait_for
 
 _WHY_NOT = (
@@ -25,6 +26,18 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.timeout(2 * PATIENCE_S))
             if _WHY_NOT:
                 item.add_marker(pytest.mark.skip(reason=_WHY_NOT))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def loaded() -> None:
+    """Have what is compiled loaded here, so that every process forked from this one has it.
+
+    It takes an emulated processor seconds, which the first TPDO would come too late by.
+    """
+    if not _WHY_NOT:
+        rig = Rig(settings_with())
+        Loop(rig).run(300)
+        rig.close()
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import can
@@ -52,6 +52,17 @@ def wait_for(condition: Callable[[], bool]) -> None:
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.05)
+
+
+def first_difference(one: Sequence[object], other: Sequence[object]) -> tuple[object, ...] | None:
+    """Where two sequences differ first, and how; of lengths, if in nothing else. None: they don't.
+
+    pytest would lay thousands of frames side by side, for minutes.
+    """
+    for n, pair in enumerate(zip(one, other, strict=False)):
+        if pair[0] != pair[1]:
+            return n, *pair
+    return None if len(one) == len(other) else (len(one), len(other))
 
 
 class Canwall:

@@ -12,7 +12,7 @@ _SLOW = {
     "wait_s = 5.0": "wait_s = 60.0\nwatchdog_s = 2.0",
     "stiffness_nm_per_rad = 50.0": "stiffness_nm_per_rad = 0.5",
     "hold_cycles = 2": "hold_cycles = 100",
-    "ramp_cycles = 10": "ramp_cycles = 1000",
+    "ramp_cycles = 10": "ramp_cycles = 1000\nstuck_rad = 0.0",
     'law = "half_sample"': 'law = "standard"',
     **UNTIL_STOPPED,
 }
