@@ -1,5 +1,6 @@
 """Interfaces that go down, queues that fill up, and error frames, in the middle of a run."""
 
+import re
 import struct
 
 from commands import Record
@@ -34,7 +35,7 @@ def test_interface_down_and_up(bench: Bench) -> None:
         ip("link", "set", "vcan0", "up")
     _assert_told_in_lines(run)
     assert "the bus failed" in run.errors[0]
-    assert "Network is down" in run.errors[0]
+    assert re.search("[Nn]etwork is down|interface is down", run.errors[0])
     # Nobody could tell the drive: its watchdog did.
     bus = bench.bus()
     wait_for(lambda: is_disabled(bus))
@@ -57,7 +58,7 @@ def test_transmit_queue_that_stays_full(bench: Bench) -> None:
         tc("qdisc", "del", "dev", "vcan0", "root")
     _assert_told_in_lines(run)
     assert "the bus failed" in run.errors[0]
-    assert "the transmit queue stays full" in run.errors[0]
+    assert re.search("transmit (queue stays|buffer) full", run.errors[0])
     bus = bench.bus()
     wait_for(lambda: is_disabled(bus))
     assert drive.interrupt() == 0
