@@ -34,7 +34,15 @@ from canwall.cycle import (
     run_loop,
     timing_summary,
 )
-from canwall.drive import REQUIRED_OBJECTS, DriveError, DriveNode, DriveSetup, Link, set_up
+from canwall.drive import (
+    REQUIRED_OBJECTS,
+    DriveError,
+    DriveNode,
+    DriveSetup,
+    Link,
+    refuse_second_master,
+    set_up,
+)
 from canwall.eds import load_eds
 from canwall.errors import RunFailedError
 from canwall.live import open_to_changes
@@ -121,13 +129,14 @@ def serve_drive(
 ) -> None:
     """A simulated drive alone on its bus, until stopped (`canwall drive`).
 
-    `joined` is called when it hears what is on the bus, report is told of its faults.
+    `joined` is called when it hears what is on the bus, report is told of its faults, and of the
+    bus being gone.
     """
     drive = make_simulated_drive(settings, report)
     with open_bus(settings) as bus:
         # A controller makes its own error frames; given one, it sends it as data.
         virtual = settings.bus.interface == "unixcan" or settings.bus.channel.startswith("vcan")
-        runner = simdrive.BusRunner(drive, bus, error_frames=virtual)
+        runner = simdrive.BusRunner(drive, bus, error_frames=virtual, report=report)
         joined()
         runner.run(stop)
 
@@ -400,11 +409,14 @@ def _recorded(folder: RunFolder, troubles: list[str]) -> pa.Table:
 def on_the_bus(*many: Settings) -> Iterator[Link]:
     """A link to the bus; embedded drives live on the same bus, in the master's idle time.
 
-    Raises ConfigError and DictionaryError.
+    Raises ConfigError and DictionaryError, DriveError where another master is on it.
     """
     if not many[0].embedded:
         with open_bus(many[0]) as bus:
-            yield Link(bus)
+            link = Link(bus)
+            nodes = [settings.drive.node_id for settings in many]
+            refuse_second_master(link, many[0].bus, nodes)
+            yield link
         return
     drives = [make_simulated_drive(settings) for settings in many]
     with ExitStack() as stack:

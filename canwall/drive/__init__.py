@@ -13,6 +13,7 @@ from canwall.drive.cia402 import (
     status_text,
 )
 from canwall.drive.link import Link
+from canwall.drive.masters import refuse_second_master
 from canwall.drive.node import DriveError, DriveNode
 from canwall.drive.pdo import Field, PdoLayout
 from canwall.drive.setup import REQUIRED_OBJECTS, DriveSetup, disable, set_up
@@ -35,6 +36,7 @@ __all__ = [
     "controlword_down",
     "controlword_up",
     "disable",
+    "refuse_second_master",
     "set_up",
     "state_of",
     "status_text",

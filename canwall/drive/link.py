@@ -6,6 +6,7 @@ transfers and the cycle need no lock and no second thread.
 """
 
 import contextlib
+import errno
 import logging
 import struct
 import time
@@ -27,6 +28,10 @@ _ANSWERS = {0: 1, 1: 3, 2: 2, 3: 0}
 _ABORT = 4
 #: Requests whose answer repeats index and subindex.
 _INITIATE = (1, 2)
+
+#: How long a transmit queue may stay full: one of ten frames empties in 11 ms at 125 kbit/s.
+_QUEUE_PATIENCE_S = 0.05
+_QUEUE_RETRY_S = 0.0002
 
 #: Takes note of a frame: time [s], message, whether it was received (else sent).
 FrameLog = Callable[[float, can.Message, bool], None]
@@ -55,9 +60,32 @@ class Link:
 
     def send(self, message: can.Message) -> None:
         """Send and take note of it. Raises can.CanError."""
-        self.bus.send(message)
+        try:
+            self.bus.send(message)
+        except can.CanOperationError as error:
+            if error.error_code != errno.ENOBUFS:
+                raise
+            self._send_when_there_is_room(message)
         if self.log is not None:
             self.log(time.time(), message, False)
+
+    def _send_when_there_is_room(self, message: can.Message) -> None:
+        # python-can gives up at once: such a socket always seems ready to be written.
+        deadline = time.monotonic() + _QUEUE_PATIENCE_S
+        while time.monotonic() < deadline:
+            time.sleep(_QUEUE_RETRY_S)
+            try:
+                self.bus.send(message)
+                return
+            except can.CanOperationError as error:
+                if error.error_code != errno.ENOBUFS:
+                    raise
+        raise can.CanOperationError(
+            f"the transmit queue stays full for {_QUEUE_PATIENCE_S * 1e3:.0f} ms; does anybody "
+            "acknowledge, at this bit rate, is there too much on the bus, or is the interface's "
+            "txqueuelen below what is sent in a cycle?",
+            errno.ENOBUFS,
+        )
 
     def receive(self, timeout_s: float) -> can.Message | None:
         """The next frame, or None if there is none within the time. Raises can.CanError."""
@@ -84,9 +112,7 @@ class Link:
             message = self.receive(remaining)
             if message is None:
                 return None
-            if message.arbitration_id in can_ids and not (
-                message.is_remote_frame or message.is_error_frame
-            ):
+            if message.arbitration_id in can_ids and _carries_data(message):
                 return message
             self.dispatch(message)
             remaining = max(0.0, deadline - time.monotonic())
@@ -97,7 +123,7 @@ class Link:
             if self.on_error_frame is not None:
                 self.on_error_frame(message)
             return
-        if message.is_remote_frame:
+        if not _carries_data(message):
             return
         # Somebody's heartbeat without data, or EMCY too short, is not to end the cycle.
         with contextlib.suppress(struct.error):
@@ -117,6 +143,18 @@ class Link:
     def close(self) -> None:
         """Leave the bus."""
         self.bus.shutdown()
+
+
+def _carries_data(message: can.Message) -> bool:
+    """Whether it is a data frame, its identifier of 11 bits where these are enough.
+
+    A short number in an identifier of 29 bits is another identifier than that number in 11 bits.
+    """
+    return not (
+        message.is_remote_frame
+        or message.is_error_frame
+        or (message.is_extended_id and message.arbitration_id <= 0x7FF)
+    )
 
 
 class _Network(canopen.Network):  # type: ignore[misc]

@@ -1,5 +1,6 @@
 """Attaches a simulated drive to a python-can bus."""
 
+import errno
 import time
 from collections.abc import Callable, Iterable
 from typing import Any, Protocol
@@ -10,6 +11,9 @@ from canwall.simdrive.communication.frame import ERROR_FRAME, Frame
 
 _TICK_S = 0.001
 """Least time between ticks, and longest wait for a frame."""
+
+_DISTURBED = (errno.ENETDOWN, errno.ENOBUFS)
+"""What an interface answers that is down, or whose transmit queue is full."""
 
 
 class Device(Protocol):
@@ -65,6 +69,7 @@ class BusRunner:
         bus: can.BusABC,
         clock: Callable[[], float] = time.monotonic,
         error_frames: bool = True,
+        report: Callable[[str], None] = lambda line: None,
     ) -> None:
         """Switch the drive on: its boot-up message goes onto the bus.
 
@@ -74,6 +79,7 @@ class BusRunner:
             clock: tells the time in seconds.
             error_frames: whether the bus takes error frames. A real controller makes its own, and
                 sends as data what it is given.
+            report: is told when ``run`` finds the bus gone, and when it is back.
 
         Raises:
             can.CanError: the bus does not take the message.
@@ -82,6 +88,8 @@ class BusRunner:
         self._bus = bus
         self._clock = clock
         self._error_frames = error_frames
+        self._report = report
+        self._gone = ""
         self._last_tick_s = clock()
         self._send(drive.boot())
 
@@ -98,14 +106,32 @@ class BusRunner:
     def run(self, stop: Callable[[], bool]) -> None:
         """Serve the bus until ``stop`` says so; it is asked every millisecond or more often.
 
+        A drive does not end with its bus: while the interface is down, or takes no frames, what
+        would have been sent is lost, and time passes for the drive.
+
         Raises:
-            can.CanError: the bus fails.
+            can.CanError: the bus fails for good.
         """
         while not stop():
-            message = self._bus.recv(_TICK_S)
-            if message is not None:
-                self._handle(message)
-            self._tick(_TICK_S)
+            try:
+                message = self._bus.recv(_TICK_S)
+                if message is not None:
+                    self._handle(message)
+                self._tick(_TICK_S)
+            except can.CanOperationError as error:
+                if error.error_code not in _DISTURBED:
+                    raise
+                self._disturbed(str(error))
+            else:
+                if message is not None:
+                    self._disturbed("")
+
+    def _disturbed(self, why: str) -> None:
+        if why and not self._gone:
+            self._report(f"the bus is gone: {why}; the drive goes on without")
+        elif self._gone and not why:
+            self._report("the bus is back")
+        self._gone = why
 
     def _handle(self, message: can.Message) -> None:
         if message.is_error_frame or message.is_extended_id or message.is_fd:
@@ -120,9 +146,10 @@ class BusRunner:
 
     def _tick(self, least_s: float) -> None:
         now_s = self._clock()
-        if now_s - self._last_tick_s >= least_s:
-            self._send(self._drive.tick(now_s - self._last_tick_s))
+        passed_s = now_s - self._last_tick_s
+        if passed_s >= least_s:
             self._last_tick_s = now_s
+            self._send(self._drive.tick(passed_s))
 
     def _send(self, frames: Iterable[Frame]) -> None:
         for can_id, data in frames:

@@ -1,10 +1,13 @@
 """One thread for everything on the bus: SDO, EMCY and the frames of others, among one another."""
 
+import errno
 import logging
+import math
 import struct
 
 import can
 import pytest
+from can.interfaces.virtual import VirtualBus
 from rig import SDO_ANSWER, Rig, RigFactory
 
 from canwall.drive import DriveError, Link
@@ -135,3 +138,63 @@ def test_without_idle_the_bus_is_waited_on(rig: Rig) -> None:
     link.close()
     with pytest.raises(can.CanOperationError):
         link.receive(0.0)
+
+
+# A transmit queue that is full, as SocketCAN tells it
+
+
+class FullQueue(VirtualBus):
+    """Takes no frame for a number of attempts, then all of them."""
+
+    def __init__(self, channel: str, attempts: float, code: int = errno.ENOBUFS) -> None:
+        super().__init__(channel)
+        self.attempts, self.code = attempts, code
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        if self.attempts > 0:
+            self.attempts -= 1
+            raise can.CanOperationError("Failed to transmit", self.code)
+        super().send(msg, timeout)
+
+
+def test_full_queue_is_waited_for() -> None:
+    noted: list[int] = []
+    with FullQueue("full queue", 3) as bus, VirtualBus("full queue") as other:
+        link = Link(bus)
+        link.log = lambda time_s, message, received: noted.append(message.arbitration_id)
+        link.send(can.Message(arbitration_id=0x205, is_extended_id=False))
+        received = other.recv(0)
+        assert received is not None
+        assert received.arbitration_id == 0x205
+        assert other.recv(0) is None
+    assert noted == [0x205]
+
+
+def test_queue_that_stays_full_is_an_error() -> None:
+    noted: list[int] = []
+    with FullQueue("stays full", math.inf) as bus:
+        link = Link(bus)
+        link.log = lambda time_s, message, received: noted.append(message.arbitration_id)
+        with pytest.raises(can.CanOperationError, match="the transmit queue stays full for 50 ms"):
+            link.send(can.Message(arbitration_id=0x205, is_extended_id=False))
+    assert noted == []
+
+
+def test_another_error_is_not_waited_for() -> None:
+    with FullQueue("down", 1, errno.ENETDOWN) as bus:
+        with pytest.raises(can.CanOperationError, match="Failed to transmit"):
+            Link(bus).send(can.Message(arbitration_id=0x205, is_extended_id=False))
+        assert bus.attempts == 0
+
+
+def test_a_short_number_in_29_bits_is_another_identifier(rig: Rig) -> None:
+    heard: list[int] = []
+    rig.link.network.subscribe(0x085, lambda can_id, data, timestamp: heard.append(can_id))
+    for extended in (True, False):
+        for can_id in (0x085, 0x185):
+            message = can.Message(arbitration_id=can_id, is_extended_id=extended, data=bytes(8))
+            rig.drive_bus.send(message)
+    message = rig.link.wait_for([0x185], 1.0)
+    assert message is not None
+    assert not message.is_extended_id
+    assert heard == [0x085]

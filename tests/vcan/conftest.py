@@ -1,0 +1,94 @@
+"""A bench on vcan0 for each test, and the runs that several of them look at."""
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from commands import Record
+from rig import Loop, Rig, settings_with
+from socketcan import PATIENCE_S, Bench, Canwall, has_socketcan, is_up, wait_for
+
+_WHY_NOT = (
+    "the kernel has no SocketCAN (PF_CAN); scripts/vcan-guest python -m pytest tests/vcan"
+    if not has_socketcan()
+    else "no vcan0; as root: ip link add vcan0 type vcan; ip link set vcan0 up"
+    if not is_up("vcan0")
+    else ""
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    here = Path(__file__).parent
+    for item in items:
+        if here in item.path.parents:
+            item.add_marker(pytest.mark.timeout(2 * PATIENCE_S))
+            if _WHY_NOT:
+                item.add_marker(pytest.mark.skip(reason=_WHY_NOT))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def loaded() -> None:
+    """Have what is compiled loaded here, so that every process forked from this one has it.
+
+    It takes an emulated processor seconds, which the first TPDO would come too late by.
+    """
+    if not _WHY_NOT:
+        rig = Rig(settings_with())
+        Loop(rig).run(300)
+        rig.close()
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    bench = Bench(tmp_path)
+    yield bench
+    bench.close()
+
+
+@dataclass(frozen=True)
+class Strikes:
+    """The main job on vcan0, and what was beside it."""
+
+    record: Record
+    out: str
+    candump: Path
+    second_master: Canwall
+    folder_of_the_second: Path
+
+
+@pytest.fixture(scope="session")
+def strikes(tmp_path_factory: pytest.TempPathFactory) -> Strikes:
+    """Four strikes; candump, a load from cangen, cansend and a second master beside them."""
+    folder = tmp_path_factory.mktemp("strikes")
+    bench = Bench(folder)
+    drive = bench.drive()
+    candump = folder / "candump.log"
+    dump = bench.start("candump", "-L", "vcan0", output=candump)
+    # As anything else on a bus: identifiers that are nobody's here, data at random.
+    bench.start("cangen", "vcan0", "-g", "30", "-I", "7A0", "-L", "8", "-D", "r")
+    run = bench.canwall("run", bench.config(), "--output", folder / "run")
+    wait_for(lambda: b" 080#" in candump.read_bytes() or not run.running)
+    bench.start("cansend", "vcan0", "605#4018100100000000").wait()
+    second = bench.canwall("run", bench.config(), "--output", folder / "second")
+    second.wait()
+    assert (run.wait(), run.errors) == (0, [])
+    dump.terminate()
+    dump.wait()
+    assert drive.interrupt() == 0
+    bench.close()
+    return Strikes(Record(folder / "run"), run.out, candump, second, folder / "second")
+
+
+@pytest.fixture(scope="session")
+def embedded(request: pytest.FixtureRequest) -> Record:
+    """The same four strikes with the drive on the bus inside the program.
+
+    The guest is given the record of its host, which comes to it ten times faster.
+    """
+    given = os.environ.get("CANWALL_EMBEDDED_RECORD")
+    if given:
+        return Record(Path(given))
+    record: Record = request.getfixturevalue("four_strikes")
+    return record

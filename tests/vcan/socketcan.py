@@ -1,0 +1,225 @@
+"""`canwall` in processes of its own on SocketCAN, can-utils beside it, and where they meet."""
+
+import contextlib
+import multiprocessing
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import can
+import pytest
+from commands import config_file, torque_is_on
+
+import canwall.run  # noqa: F401 (loaded here, it is there in every process)
+from canwall import cli, config
+from canwall.drive import State, state_of
+
+VCAN_CONFIG = config.shipped("config/vcan.toml")
+
+#: A guest under emulation, on a machine that has other things to do, takes its time.
+PATIENCE_S = 200.0
+
+#: Changes of config/vcan.toml: a hand that leans on the wall, until the run ends by itself.
+UNTIL_STOPPED = {"rest_rad = 0.1": "rest_rad = -0.1", "duration_s = 4.2": ""}
+
+_SDO_REQUEST, _SDO_ANSWER, _STATUSWORD = 0x605, 0x585, b"\x40\x41\x60\x00\0\0\0\0"
+
+
+def has_socketcan() -> bool:
+    """Whether this kernel has PF_CAN."""
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except OSError:
+        return False
+    return True
+
+
+def is_up(interface: str) -> bool:
+    with contextlib.suppress(OSError), can.Bus(interface="socketcan", channel=interface):
+        return True
+    return False
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def first_difference(one: Sequence[object], other: Sequence[object]) -> tuple[object, ...] | None:
+    """Where two sequences differ first, and how; of lengths, if in nothing else. None: they don't.
+
+    pytest would lay thousands of frames side by side, for minutes.
+    """
+    for n, pair in enumerate(zip(one, other, strict=False)):
+        if pair[0] != pair[1]:
+            return n, *pair
+    return None if len(one) == len(other) else (len(one), len(other))
+
+
+class Canwall:
+    """`canwall ARGUMENTS` in a process of its own.
+
+    It is forked from this one, which has loaded already what takes an emulated processor twenty
+    seconds to load.
+    """
+
+    def __init__(self, folder: Path, *arguments: object) -> None:
+        folder.mkdir()
+        self._out, self._err = folder / "out.txt", folder / "err.txt"
+        words = [str(word) for word in arguments]
+        fork = multiprocessing.get_context("fork")
+        self._process = fork.Process(target=_main, args=(words, self._out, self._err))
+        with warnings.catch_warnings():
+            # Python 3.12 and newer warn of forking where libraries have threads. Theirs are idle.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            self._process.start()
+
+    @property
+    def out(self) -> str:
+        return self._out.read_text() if self._out.exists() else ""
+
+    @property
+    def errors(self) -> list[str]:
+        """Lines of its standard error."""
+        return self._err.read_text().splitlines() if self._err.exists() else []
+
+    @property
+    def running(self) -> bool:
+        return self._process.is_alive()
+
+    def wait(self) -> int:
+        """Its exit code."""
+        self._process.join(PATIENCE_S)
+        assert self._process.exitcode is not None, "still runs"
+        return self._process.exitcode
+
+    def interrupt(self) -> int:
+        """End it as Ctrl-C does."""
+        assert self._process.pid is not None
+        os.kill(self._process.pid, signal.SIGINT)
+        return self.wait()
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.join()
+
+
+def _main(words: list[str], out: Path, err: Path) -> None:
+    for descriptor, path in ((1, out), (2, err)):
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+        os.dup2(file, descriptor)
+    sys.stdout = open(1, "w", buffering=1, closefd=False)  # noqa: SIM115 (until the process ends)
+    sys.stderr = open(2, "w", buffering=1, closefd=False)  # noqa: SIM115
+    sys.argv = ["canwall", *words]
+    cli.main()
+
+
+class Bench:
+    """Programs on an interface, ended with the test."""
+
+    def __init__(self, folder: Path, interface: str = "vcan0") -> None:
+        self.folder, self.interface = folder, interface
+        self._stack = contextlib.ExitStack()
+        self._started = 0
+
+    def close(self) -> None:
+        self._stack.close()
+
+    def config(self, changes: dict[str, str] | None = None) -> Path:
+        """config/vcan.toml with other text in places."""
+        self._started += 1
+        return config_file(self.folder / f"{self._started}.toml", changes, VCAN_CONFIG)
+
+    def canwall(self, *arguments: object) -> Canwall:
+        self._started += 1
+        folder = self.folder / f"canwall{self._started}"
+        program = Canwall(folder, *arguments)
+        self._stack.callback(program.kill)
+        return program
+
+    def drive(self, configuration: Path = VCAN_CONFIG) -> Canwall:
+        """A simulated drive that hears what is on the bus."""
+        drive = self.canwall("drive", configuration)
+        wait_for(lambda: "simulated drive, node 5, on socketcan" in drive.out)
+        return drive
+
+    def start(self, *command: object, output: Path | None = None) -> "subprocess.Popen[bytes]":
+        """One of can-utils, in the background."""
+        words = [str(word) for word in command]
+        if shutil.which(words[0]) is None:
+            pytest.skip(f"{words[0]} is not installed (Debian: can-utils)")
+        with contextlib.ExitStack() as files:
+            stdout = (
+                subprocess.DEVNULL if output is None else files.enter_context(output.open("wb"))
+            )
+            program = subprocess.Popen(words, stdout=stdout)
+        self._stack.enter_context(program)
+        self._stack.callback(program.kill)
+        return program
+
+    def bus(self) -> can.BusABC:
+        """A socket of the test's own on the interface."""
+        bus = can.Bus(interface="socketcan", channel=self.interface)
+        self._stack.callback(bus.shutdown)
+        return bus
+
+
+def run_with_torque(bench: Bench, folder: Path, configuration: Path) -> Canwall:
+    """`canwall run` that renders the wall, and commands a torque by now."""
+    run = bench.canwall("run", configuration, "--output", folder)
+    wait_for(lambda: torque_is_on(folder / "bus.log") or not run.running)
+    assert run.running, run.errors
+    return run
+
+
+def statusword(bus: can.BusABC) -> int | None:
+    """The drive's statusword over SDO; None where there is no answer."""
+    with contextlib.suppress(can.CanError):
+        while bus.recv(0) is not None:
+            pass
+        bus.send(can.Message(arbitration_id=_SDO_REQUEST, data=_STATUSWORD, is_extended_id=False))
+        for message in _frames(bus, 2.0):
+            if message.arbitration_id == _SDO_ANSWER and message.data[:4] == b"\x4b\x41\x60\x00":
+                return int.from_bytes(message.data[4:6], "little")
+    return None
+
+
+def is_disabled(bus: can.BusABC) -> bool:
+    """Whether the drive says that it gives no torque."""
+    word = statusword(bus)
+    return word is not None and state_of(word) in (State.SWITCH_ON_DISABLED, State.FAULT)
+
+
+def _frames(bus: can.BusABC, seconds: float) -> Iterator[can.Message]:
+    deadline = time.monotonic() + seconds
+    while (remaining := deadline - time.monotonic()) > 0.0:
+        message = bus.recv(remaining)
+        if message is not None:
+            yield message
+
+
+def ip(*arguments: object) -> None:
+    """`ip ARGUMENTS`, which takes root; the test is skipped where it is not allowed."""
+    _as_root("ip", *arguments)
+
+
+def tc(*arguments: object) -> None:
+    """`tc ARGUMENTS`, likewise."""
+    _as_root("tc", *arguments)
+
+
+def _as_root(*command: object) -> None:
+    words = [str(word) for word in command]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    if "not permitted" in done.stderr:
+        pytest.skip(f"{' '.join(words)} takes root: run scripts/test as root, or in a guest")
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,66 @@
+"""A recorded bus log on the bus again, by can-utils' canplayer."""
+
+import struct
+from pathlib import Path
+
+import can
+from commands import Record, read_log
+from conftest import Strikes
+from rig import RPDO1, SDO_REQUEST, SYNC, TPDO1
+from socketcan import (
+    PATIENCE_S,
+    UNTIL_STOPPED,
+    Bench,
+    first_difference,
+    is_disabled,
+    run_with_torque,
+    wait_for,
+)
+
+_OF_THE_MASTER = (0x000, SYNC, RPDO1, SDO_REQUEST)
+
+
+def _write_log(path: Path, frames: list[can.Message]) -> None:
+    with can.CanutilsLogWriter(path, channel="vcan0") as log:
+        for frame in frames:
+            log.on_message_received(frame)
+
+
+def test_replayed_master_gets_the_recorded_answers(strikes: Strikes, bench: Bench) -> None:
+    """What a drive answers depends on the frames alone: another one gives the same positions."""
+    frames = strikes.record.frames
+    syncs = [n for n, frame in enumerate(frames) if frame.arbitration_id == SYNC]
+    one_strike = frames[: syncs[900]]
+    log = bench.folder / "master.log"
+    _write_log(log, [frame for frame in one_strike if frame.arbitration_id in _OF_THE_MASTER])
+    recorded = [bytes(f.data) for f in one_strike if f.arbitration_id == TPDO1]
+    bench.drive()
+    dump = bench.start("candump", "-L", "vcan0,185:7FF", output=bench.folder / "candump.log")
+    player = bench.start("canplayer", "-I", log)
+    assert player.wait(PATIENCE_S) == 0
+
+    def answered() -> list[bytes]:
+        return [bytes(frame.data) for frame in read_log(bench.folder / "candump.log")]
+
+    wait_for(lambda: len(answered()) >= len(recorded))
+    dump.terminate()
+    dump.wait()
+    assert first_difference(answered(), recorded) is None
+    torques = [struct.unpack("<iHh", data)[2] for data in recorded]
+    assert max(torques) > 100, "the strike is in it"
+
+
+def test_replay_beside_a_run_is_a_second_master(strikes: Strikes, bench: Bench) -> None:
+    """Whoever does not listen first is found out by his first SYNC."""
+    syncs = [frame for frame in strikes.record.frames if frame.arbitration_id == SYNC][:5]
+    log = bench.folder / "syncs.log"
+    _write_log(log, syncs)
+    bench.drive()
+    folder = bench.folder / "run"
+    run = run_with_torque(bench, folder, bench.config(UNTIL_STOPPED))
+    bench.start("canplayer", "-I", log)
+    assert run.wait() == 1
+    (line,) = run.errors
+    assert "somebody else sends SYNC (0x080) as well" in line
+    assert struct.unpack("<Hh", Record(folder).cycles[-1][1]) == (0, 0)
+    assert is_disabled(bench.bus())

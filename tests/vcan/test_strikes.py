@@ -1,0 +1,59 @@
+"""The main job with its drive behind SocketCAN, and what others may do on the bus meanwhile."""
+
+from collections import Counter
+
+import numpy as np
+from commands import Record, read_log
+from conftest import Strikes
+from rig import RPDO1, SDO_ANSWER, SYNC, TPDO1
+from socketcan import first_difference
+
+
+def test_signals_are_those_of_the_embedded_bus(strikes: Strikes, embedded: Record) -> None:
+    """Bit by bit on the bus; what is computed beside, but for rounding on another processor."""
+    ours, theirs = strikes.record.signals, embedded.signals
+    assert ours.num_rows > 4200
+    assert first_difference(strikes.record.cycles, embedded.cycles) is None
+    assert ours.schema.equals(theirs.schema)
+    for name in set(ours.column_names) - {"sync_interval_s", "latency_s"}:
+        one, other = strikes.record.column(name), embedded.column(name)
+        if one.dtype.kind == "f":
+            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9, err_msg=name)
+        else:
+            assert np.array_equal(one, other), name
+
+
+def test_standard_chatters_and_half_sample_does_not(strikes: Strikes) -> None:
+    found = strikes.record.summary["strikes"]
+    assert [strike["law"] for strike in found] == ["standard", "half_sample"] * 2
+    assert [strike["chatter"] for strike in found] == [True, False, True, False]
+
+
+def test_candump_has_the_record_frame_by_frame(strikes: Strikes) -> None:
+    logged, recorded = read_log(strikes.candump), strikes.record.frames
+    for can_id in (SYNC, TPDO1, RPDO1, 0x000, 0x605):
+        seen, own = (
+            [bytes(frame.data) for frame in frames if frame.arbitration_id == can_id]
+            for frames in (logged, recorded)
+        )
+        assert own, hex(can_id)
+        assert first_difference(seen, own) is None, hex(can_id)
+
+
+def test_load_and_foreign_sdo_pass_by(strikes: Strikes) -> None:
+    seen = Counter(frame.arbitration_id for frame in strikes.record.frames)
+    assert seen[0x7A0] > 50
+    vendor = [
+        bytes(frame.data)
+        for frame in strikes.record.frames
+        if frame.arbitration_id == SDO_ANSWER and frame.data[1:4] == b"\x18\x10\x01"
+    ]
+    assert vendor, "the answer to cansend's question"
+
+
+def test_second_master_is_refused_before_it_sends(strikes: Strikes) -> None:
+    assert strikes.second_master.wait() == 1
+    (line,) = strikes.second_master.errors
+    assert line.startswith("canwall: another master is on the bus: it sends ")
+    assert line.endswith("; end it first")
+    assert not strikes.folder_of_the_second.exists()
