@@ -12,7 +12,8 @@ from canopen.profiles.p402 import State402
 from commands import Record, config_file
 from rig import SDO_REQUEST, SYNC
 
-import canwall.run
+import canwall.run.buses
+import canwall.run.running
 from canwall import cli, simdrive
 from canwall.config import NUMBERS, Settings
 from canwall.cycle import exchange as exchange_module
@@ -90,15 +91,15 @@ class Witness:
 def witnesses(monkeypatch: pytest.MonkeyPatch) -> list[Witness]:
     """Of every drive that is simulated."""
     found: list[Witness] = []
-    make = canwall.run.make_simulated_drive
+    make = canwall.run.buses.make_simulated_drive
 
     def watched(settings: Settings) -> simdrive.FaultyDrive:
         drive = make(settings)
         found.append(Witness(drive))
         return drive
 
-    monkeypatch.setattr(canwall.run, "make_simulated_drive", watched)
-    monkeypatch.setattr(canwall.run, "plot_run", lambda folder: None)
+    monkeypatch.setattr(canwall.run.buses, "make_simulated_drive", watched)
+    monkeypatch.setattr(canwall.run.running, "plot_run", lambda folder: None)
     monkeypatch.setattr(exchange_module, "_SIMULATED_TIMEOUT_S", 0.02)
     monkeypatch.setattr(exchange_module, "_MISSING_TIMEOUT_S", 0.002)
     return found

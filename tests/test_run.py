@@ -29,7 +29,8 @@ from commands import (
 )
 from rig import RPDO1, SDO_ANSWER, SDO_REQUEST, SYNC, TPDO1, settings_with
 
-import canwall.run
+import canwall.run.buses
+import canwall.run.running
 from canwall import config
 from canwall.cycle import make_cycle, run_laws, set_wall, step
 from canwall.cycle.step import start_at
@@ -394,7 +395,7 @@ def test_bus_that_fails_before_the_first_cycle(
                 raise can.CanOperationError("transmit buffer full")
             super().send(msg, timeout)
 
-    monkeypatch.setattr(canwall.run, "open_bus", lambda settings: NoSync("no sync"))
+    monkeypatch.setattr(canwall.run.buses, "open_bus", lambda settings: NoSync("no sync"))
     with pytest.raises(RunFailedError, match="the bus failed: transmit buffer full"):
         canwall.run.run(settings_with(), tmp_path / "run")
 
@@ -407,7 +408,7 @@ def test_record_that_is_lost(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) ->
             super().__init__(*args)
             recorders.append(self)
 
-    monkeypatch.setattr(canwall.run, "Recorder", Lost)
+    monkeypatch.setattr(canwall.run.running, "Recorder", Lost)
     settings = settings_with({"run.duration_s": 0.3})
     with pytest.raises(RunFailedError, match="the writer of the record did not finish"):
         canwall.run.run(

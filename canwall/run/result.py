@@ -1,0 +1,101 @@
+"""What a run came to: its summary, and what there is to be said of it."""
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import pyarrow as pa
+
+from canwall.config import ConfigError, Settings
+from canwall.cycle import Axis, Exchange, Outcome, Watch, timing_summary
+from canwall.drive import DriveSetup
+from canwall.errors import RunFailedError
+from canwall.record import RecordError, RunFolder, read_signals
+from canwall.referent import referent_positions
+from canwall.summary import summarise
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run came to: notes are what the record lacks, remarks what the drive would not do."""
+
+    folder: RunFolder
+    summary: dict[str, Any]
+    outcome: Outcome
+    notes: list[str]
+    remarks: list[str]
+
+
+def result_of(
+    axis: Axis,
+    exchange: Exchange,
+    watch: Watch,
+    scheduling: dict[str, str],
+    folder: RunFolder,
+    outcome: Outcome,
+    notes: list[str],
+    remarks: list[str],
+) -> RunResult:
+    """Summary of one axis, and its last cycles where it tripped."""
+    settings = axis.settings
+    signals = _recorded(folder, [*outcome.trips, *notes])
+    asked_for = (signals[name].to_numpy() for name in ("stiffness", "damping", "wall_position_rad"))
+    referent = referent_positions(settings, *asked_for)
+    summary = summarise(signals, settings, axis.setup.units, referent)
+    summary |= {
+        "missed_tpdo": int(axis.cycle["missed_tpdo"][0]),
+        "late_rpdo": axis.late_rpdo,
+        "error_frames": watch.error_frames,
+        "trips": outcome.trips,
+        "trip_cycle": outcome.trip_cycle,
+        "interrupted": outcome.interrupted,
+        "delay_cycles": axis.delay,
+        "drive": _described(axis.setup),
+        "timing": {
+            "exchange": exchange.name,
+            **scheduling,
+            "sync_interval": timing_summary(exchange.sync_interval),
+            "tpdo_to_rpdo": timing_summary(axis.latency),
+        },
+    }
+    folder.summary.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    if outcome.trip_cycle is not None:
+        folder.write_trip(signals, outcome.trip_cycle)
+    return RunResult(folder, summary, outcome, notes, remarks)
+
+
+def _recorded(folder: RunFolder, troubles: list[str]) -> pa.Table:
+    """The signals of the run; without any, its troubles are all that is left to say."""
+    try:
+        signals = read_signals(folder.signals)
+    except ConfigError as error:
+        raise RecordError("; ".join(troubles) or str(error)) from None
+    if signals.num_rows == 0:
+        raise RunFailedError("; ".join(troubles))
+    return signals
+
+
+def remarks_on(setup: DriveSetup, settings: Settings) -> list[str]:
+    """What the drive would not do, and does otherwise than was asked."""
+    remarks = [f"the drive: {note}" for note in setup.notes]
+    if setup.torque_limit_nm < settings.limits.torque_nm and setup.scales is not None:
+        whence = setup.scales.sources[-1][1]
+        remarks.append(
+            f"the drive holds the torque to {setup.torque_limit_nm:g} N·m ({whence}), below "
+            f"limits.torque_nm = {settings.limits.torque_nm:g}; [drive.parameters] may raise it"
+        )
+    if setup.watchdog.kind == "none":
+        remarks.append("the drive has no watchdog: a master that dies leaves the torque on")
+    return remarks
+
+
+def _described(setup: DriveSetup) -> dict[str, Any]:
+    return {
+        "mode": str(setup.mode),
+        "watchdog": str(setup.watchdog),
+        "notes": list(setup.notes),
+        "rad_per_count": setup.units.rad_per_count,
+        "nm_per_mille": setup.units.nm_per_mille,
+        "tpdo_cob_id": setup.tpdo.cob_id,
+        "rpdo_cob_id": setup.rpdo.cob_id,
+    }

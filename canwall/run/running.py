@@ -1,0 +1,124 @@
+"""One run from configuration to folder.
+
+Prepare everything that can fail on bad input, then touch the bus, then the drive.
+"""
+
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from pathlib import Path
+
+from canwall.config import ConfigError, Settings
+from canwall.cycle import run_laws
+from canwall.live import open_to_changes
+from canwall.plots import plot_run
+from canwall.record import Recorder, RunFolder
+from canwall.run.assembly import (
+    drive_dictionary,
+    make_axis,
+    make_exchange,
+    make_watch,
+    render,
+    restored,
+    scheduled,
+)
+from canwall.run.buses import on_the_bus
+from canwall.run.result import RunResult, remarks_on, result_of
+from canwall.run.stopping import stop_on_signals
+
+
+def run(
+    settings: Settings,
+    output: Path | None,
+    report: Callable[[str], None] = lambda what: None,
+    progress: Callable[[float, float | None], None] = lambda now_s, end_s: None,
+) -> RunResult:
+    """Enable the drive, render the wall, record, summarise, draw (`canwall run`).
+
+    report is told the steps, progress the seconds of bus time done and their end. Raises
+    ConfigError and DictionaryError before anything is enabled, DriveError where the drive cannot
+    be set up, RunFailedError where no cycle came about or none was recorded.
+    """
+    (result,) = run_together([settings], output, report, progress)
+    return result
+
+
+def run_together(
+    many: Sequence[Settings],
+    output: Path | None,
+    report: Callable[[str], None] = lambda what: None,
+    progress: Callable[[float, float | None], None] = lambda now_s, end_s: None,
+) -> list[RunResult]:
+    """`run` for several drives on one bus, each with its wall, on one SYNC.
+
+    Their `[bus]` and `[run]` have to be the same. Each drive's record has a folder of its own,
+    `node5` …; the bus log lies beside these folders.
+    """
+    _check_together(many)
+    laws = [run_laws(settings) for settings in many]
+    dictionaries = [drive_dictionary(settings) for settings in many]
+    first = many[0]
+    with on_the_bus(*many) as link:
+        folders = _run_folders(many, output)
+        recorders: list[Recorder] = []
+        notes: list[list[str]] = []
+        try:
+            for settings, folder, known in zip(many, folders, laws, strict=True):
+                folder.config.write_text(settings.to_toml(), encoding="utf-8")
+                # One log of the bus for all of them.
+                log = first.run.bus_log if len(many) == 1 else f"../{first.run.bus_log}"
+                names = [law.name for law in known]
+                recorders.append(
+                    Recorder(folder.path, None if recorders else log, first.bus.channel, names)
+                )
+            link.log = recorders[0].ring.log_frame
+            report("setting up the drive" if len(many) == 1 else "setting up the drives")
+            with restored() as (axes, not_restored):
+                for settings, dictionary, known, recorder in zip(
+                    many, dictionaries, laws, recorders, strict=True
+                ):
+                    axes.append(make_axis(link, settings, dictionary, known, recorder.ring))
+                exchange = make_exchange(link, axes)
+                watch = make_watch(link, axes)
+                report("rendering")
+                with (
+                    closing(exchange),
+                    open_to_changes(axes, folders),
+                    stop_on_signals() as stop,
+                    scheduled(first) as scheduling,
+                ):
+                    outcome = render(
+                        exchange, stop, lambda now_s: progress(now_s, first.run.duration_s)
+                    )
+        finally:
+            notes = [recorder.close() for recorder in recorders]
+    report("summarising")
+    results = []
+    for axis, folder, noted in zip(axes, folders, notes, strict=True):
+        said = [*noted, *watch.notes] if axis is axes[0] else noted
+        remarks = [*remarks_on(axis.setup, axis.settings), *not_restored.get(axis.name, [])]
+        results.append(result_of(axis, exchange, watch, scheduling, folder, outcome, said, remarks))
+    report("drawing")
+    for folder in folders:
+        plot_run(folder)
+    return results
+
+
+def _check_together(many: Sequence[Settings]) -> None:
+    first = many[0]
+    for settings in many[1:]:
+        for section in ("bus", "run"):
+            if getattr(settings, section) != getattr(first, section):
+                raise ConfigError(
+                    f"[{section}] differs between the configurations: drives that run together "
+                    "share the bus and its SYNC; make the sections equal"
+                )
+    nodes = [settings.drive.node_id for settings in many]
+    if len(set(nodes)) < len(nodes):
+        raise ConfigError(f"drive.node_id: {nodes}: every drive needs one of its own")
+
+
+def _run_folders(many: Sequence[Settings], output: Path | None) -> list[RunFolder]:
+    if len(many) == 1:
+        return [RunFolder.create(output)]
+    base = output or RunFolder.default_path()
+    return [RunFolder.create(base / f"node{settings.drive.node_id}") for settings in many]
