@@ -62,6 +62,16 @@ class Exchange(ABC):
         Raises can.CanError where the bus fails.
         """
 
+    @property
+    @abstractmethod
+    def last_sync_ns(self) -> int:
+        """When the latest SYNC was, by time.perf_counter_ns; 0: there was none yet."""
+
+    def longest_pause_s(self) -> float:
+        """The longest that the drives have been without a SYNC, from the latest to now as well."""
+        since = time.perf_counter_ns() - self.last_sync_ns if self.last_sync_ns else 0
+        return max(int(self.sync_interval["largest_ns"][0]), since) * 1e-9
+
     def close(self) -> None:  # noqa: B027 (only some have anything to give back)
         """Give back what the exchange has opened; the link stays open."""
 
@@ -110,6 +120,11 @@ class PythonCanExchange(Exchange):
         }
         self._beats = Beats(link, (axis.setup.watchdog for axis in axes))
         self._last_sync_ns = 0
+
+    @property
+    def last_sync_ns(self) -> int:
+        """When the latest SYNC was, by time.perf_counter_ns; 0: there was none yet."""
+        return self._last_sync_ns
 
     def cycle(self, most: int = 1) -> None:
         """One cycle. Raises can.CanError where the bus fails."""

@@ -242,7 +242,7 @@ class _Loop:
     def _check(self) -> None:
         for axis in self._axes:
             if axis.cycle["trip"][0]:
-                raise _WallGivenUpError(self._say(axis, _trip_text(axis)))
+                raise _WallGivenUpError(self._say(axis, _trip_text(axis, self._exchange)))
 
     def leave(self) -> bool:
         """Zero torque and the state machines down; whether the drives confirmed it."""
@@ -343,7 +343,7 @@ def _emergency(axis: Axis) -> str:
     return f"; EMCY {latest.code:#06x} ({latest.get_desc() or 'no description'})"
 
 
-def _trip_text(axis: Axis) -> str:
+def _trip_text(axis: Axis, exchange: Exchange) -> str:
     cycle, row = axis.cycle[0], axis.row[0]
     j = int(row["j"])
     trip = Trip(int(cycle["trip"]))
@@ -383,7 +383,7 @@ def _trip_text(axis: Axis) -> str:
             law = axis.laws[int(cycle["rendered"]["law"][0])].name
             what = f"law {law} failed, or gave a force that is not a number"
     if trip in (Trip.NOT_ENABLED, Trip.REPORTED):
-        what += _pause(axis)
+        what += _pause(axis, exchange)
     return f"cycle {j} ({j * float(cycle['period']):.3f} s): {what}"
 
 
@@ -401,9 +401,9 @@ def _too_short(axis: Axis) -> str:
     )
 
 
-def _pause(axis: Axis) -> str:
+def _pause(axis: Axis, exchange: Exchange) -> str:
     """Why a drive has left where it was its master that was not there."""
-    watchdog, pause_s = axis.setup.watchdog, float(axis.row["sync_interval_s"][0])
+    watchdog, pause_s = axis.setup.watchdog, exchange.longest_pause_s()
     if pause_s <= watchdog.time_s:
         return ""
     return (

@@ -112,6 +112,11 @@ class NativeExchange(Exchange):
         return int(self._exchange["deadline_ns"][0])
 
     @property
+    def last_sync_ns(self) -> int:
+        """When the latest SYNC was, by time.perf_counter_ns; 0: there was none yet."""
+        return int(self._exchange["last_sync_ns"][0])
+
+    @property
     def descriptor(self) -> int:
         """What the frames of the cycle go through."""
         return int(self._exchange["descriptor"][0])
