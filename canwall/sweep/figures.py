@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import textwrap
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,34 +12,20 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
+from numpy.typing import NDArray
 
 from canwall.errors import InputError
 from canwall.plots import COLOURS, STYLE
-from canwall.sweep.analytic import (
-    delayed_stiffness,
-    passive_stiffness,
-    quantised_stiffness,
-    stable_stiffness,
-)
+from canwall.sweep.analytic import stable_stiffness
 from canwall.sweep.axes import DAMPING, STIFFNESS, STRIKES
+from canwall.sweep.labels import LABELS, circumstances, named, panel_title
+from canwall.sweep.z_width import draw_z_width
 
 #: Panels of one figure; what else there is goes into figures of its own.
 _PANELS = 6
-_LABELS = {
-    "stiffness": "K [N·m/rad]",
-    "stiffness_normalised": "K·T²/m",
-    "damping": "B [N·m·s/rad]",
-    "damping_normalised": "B·T/m",
-    "rate": "rate of the SYNC [Hz]",
-    "delay": "delay D [cycles]",
-    "model_error": "relative error of the model's inertia",
-    "counts": "encoder [counts per turn]",
-    "torque_step": "torque step [N·m]",
-}
 #: Lines of one colour are told apart by these.
 _DASHES = ("-", "--", "-.", ":")
+_MARKS = "osD^v<>P"
 
 Draw = Callable[[Axes, xr.Dataset], None]
 
@@ -51,14 +38,13 @@ def write_sweep_figures(dataset: xr.Dataset, stem: Path) -> list[Path]:
     written: list[Path] = []
     with mpl.rc_context(STYLE):
         if "worst" in dataset:
-            for axis in _long_axes(dataset["worst"]):
-                if axis != "law" and dataset[axis].dtype.kind in "if":
-                    label = f"limit-over-{axis.replace('.', '-')}"
-                    written += _paneled(dataset, stem, label, ("law", axis), _limit_over(axis))
+            for axis in _lines_over(dataset["worst"]):
+                label = f"limit-over-{axis.replace('.', '-')}"
+                written += _paneled(dataset, stem, label, ("law", axis), _limit_over(axis))
             if not written:
                 written += _paneled(dataset, stem, "limits", ("law",), _limits_by_law)
         else:
-            stiffness, damping = (_named(dataset, pair) for pair in (STIFFNESS, DAMPING))
+            stiffness, damping = (named(dataset, pair) for pair in (STIFFNESS, DAMPING))
             if dataset.sizes[stiffness] > 1:
                 # Over K at the least damping; the map shows the others.
                 least = dataset.isel({damping: 0})
@@ -67,18 +53,16 @@ def write_sweep_figures(dataset: xr.Dataset, stem: Path) -> list[Path]:
                 written += _paneled(least, stem, "amplitude", over, _chatter(stiffness))
                 written += _paneled(least, stem, "frequency", over, _frequency(stiffness))
             if dataset.sizes[damping] > 1 and dataset.sizes[stiffness] > 1:
-                written += _paneled(dataset, stem, "z-width", (damping, stiffness), _z_width)
+                written += _paneled(dataset, stem, "z-width", (damping, stiffness), draw_z_width)
     if not written:
         raise InputError("the sweep has one point alone: there is nothing to draw")
     return written
 
 
-def _named(dataset: xr.Dataset, names: tuple[str, ...]) -> str:
-    return next(name for name in names if name in dataset.dims)
-
-
-def _long_axes(array: xr.DataArray) -> list[str]:
-    return [str(dim) for dim in array.dims if array.sizes[dim] > 1]
+def _lines_over(array: xr.DataArray) -> list[str]:
+    """Axes of numbers that are worth a line: those of three values or more; else any of two."""
+    numbers = [str(d) for d in array.dims if array[d].dtype.kind in "if" and array.sizes[d] > 1]
+    return [d for d in numbers if array.sizes[d] > 2] or numbers
 
 
 def _paneled(
@@ -90,16 +74,18 @@ def _paneled(
     paths = []
     for number in range(math.ceil(len(points) / _PANELS)):
         shown = points[number * _PANELS : (number + 1) * _PANELS]
-        columns = min(3, len(shown))
+        columns = {1: 1, 2: 2, 4: 2}.get(len(shown), 3)
         rows = math.ceil(len(shown) / columns)
         figure = Figure(figsize=(4.6 * columns + 1.0, 3.8 * rows), layout="constrained", dpi=120)
         for place, point in enumerate(shown, start=1):
             axes = figure.add_subplot(rows, columns, place)
             draw(axes, dataset.isel(dict(zip(others, point, strict=True))))
-            axes.set_title(_title(dataset, dict(zip(others, point, strict=True))))
+            axes.set_title(panel_title(dataset, dict(zip(others, point, strict=True))))
+        said = textwrap.fill(circumstances(dataset), 80 * columns)
+        figure.suptitle(said, fontsize=8, color="0.3", x=0.01, ha="left")
         handles, labels = _legend(figure)
         if handles:
-            figure.legend(handles, labels, loc="outside lower center", ncols=min(4, len(labels)))
+            figure.legend(handles, labels, loc="outside lower center", ncols=min(4, 2 * columns))
         last = f"-{number + 1}" if len(points) > _PANELS else ""
         path = stem.with_name(f"{stem.name}-{name}{last}.png")
         try:
@@ -108,16 +94,6 @@ def _paneled(
             raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
         paths.append(path)
     return paths
-
-
-def _title(dataset: xr.Dataset, point: dict[str, int]) -> str:
-    parts = []
-    for name, place in point.items():
-        if dataset.sizes[name] > 1 or name in ("law", "operator"):
-            value = dataset[name].values[place]
-            said = value if isinstance(value, str) else f"{name} {value:g}"
-            parts.append(f"operator {said}" if name == "operator" else said)
-    return ", ".join(parts)
 
 
 def _legend(figure: Figure) -> tuple[list[Any], list[str]]:
@@ -131,10 +107,10 @@ def _legend(figure: Figure) -> tuple[list[Any], list[str]]:
     return list(found.values()), list(found)
 
 
-def _styles(dataset: xr.Dataset) -> list[tuple[str, str, str]]:
-    """Law, colour and dashes."""
+def _styles(dataset: xr.Dataset) -> list[tuple[str, dict[str, Any]]]:
+    """Law, and how it is drawn: by colour, dashes, and marks where lines meet."""
     return [
-        (str(law), COLOURS[i % 6], _DASHES[i // 6 % 4])
+        (str(law), {"color": COLOURS[i % 6], "ls": _DASHES[i // 6 % 4], "marker": _MARKS[i % 8]})
         for i, law in enumerate(np.atleast_1d(dataset["law"].values))
     ]
 
@@ -142,28 +118,52 @@ def _styles(dataset: xr.Dataset) -> list[tuple[str, str, str]]:
 def _limit_over(axis: str) -> Draw:
     def draw(axes: Axes, dataset: xr.Dataset) -> None:
         x = dataset[axis].values
-        for law, colour, dashes in _styles(dataset):
+        for law, style in _styles(dataset):
             one = dataset.sel(law=law)
             worst = one["worst_normalised"].values
             best = worst * (one["limit"].max(STRIKES) / one["worst"].where(one["worst"] > 0)).values
-            axes.plot(x, worst, dashes, marker="o", ms=3, color=colour, label=law)
-            axes.fill_between(x, worst, best, color=colour, alpha=0.12, lw=0)
+            axes.plot(x, worst, ms=4, mfc="none", label=law, **style)
+            axes.fill_between(x, worst, best, color=style["color"], alpha=0.08, lw=0)
+        linear = _linear_limit(dataset.isel(law=0), axis)
+        if linear is not None:
+            axes.plot(x, linear, "k--", lw=1.0, label="spring and damper, linear, exact")
         if dataset["worst_normalised"].max() > 0:
             axes.set_yscale("log")
-        axes.set_xlabel(_LABELS.get(axis, axis))
+            low, high = axes.get_ylim()
+            axes.yaxis.set_major_formatter("{x:g}")
+            axes.yaxis.set_minor_formatter("{x:.2g}" if high < 10.0 * low else "")
+        axes.set_xlabel(LABELS.get(axis, axis))
         axes.set_ylabel("K-limit, K·T²/m (band: strikes)")
 
     return draw
 
 
+def _linear_limit(dataset: xr.Dataset, axis: str) -> NDArray[np.float64] | None:
+    """K·T²/m up to which the sampled spring and damper are stable; None where it is not known."""
+    found = []
+    for place in range(dataset.sizes[axis]):
+        at = dataset.isel({axis: place})
+        mass, viscous, period, delay = (
+            at[name].item() for name in ("inertia", "viscous", "period", "loop_delay")
+        )
+        if delay != int(delay):
+            return None
+        name = named(dataset, DAMPING)
+        damping = at[name].item() * (mass / period if name == "damping_normalised" else 1.0)
+        stiffness = stable_stiffness(mass, viscous, damping, period, int(delay))
+        found.append(stiffness * period**2 / mass)
+    return np.array(found)
+
+
 def _limits_by_law(axes: Axes, dataset: xr.Dataset) -> None:
-    for place, (law, colour, _) in enumerate(_styles(dataset)):
+    for place, (law, style) in enumerate(_styles(dataset)):
+        colour = style["color"]
         one = dataset.sel(law=law)
         scale = one["worst_normalised"].item() / one["worst"].item() if one["worst"] > 0 else 0.0
         strikes = one["limit"].values.ravel() * scale
         axes.plot(strikes, np.full(strikes.shape, place), ".", color=colour, alpha=0.5)
         axes.plot(one["worst_normalised"].item(), place, "D", color=colour)
-    axes.set_yticks(range(dataset.sizes["law"]), [law for law, _, _ in _styles(dataset)])
+    axes.set_yticks(range(dataset.sizes["law"]), [law for law, _ in _styles(dataset)])
     axes.invert_yaxis()
     axes.set_xscale("log")
     axes.set_xlabel("K-limit, K·T²/m (◆ worst, · each strike)")
@@ -171,25 +171,32 @@ def _limits_by_law(axes: Axes, dataset: xr.Dataset) -> None:
 
 def _over_stiffness(axes: Axes, dataset: xr.Dataset, name: str, label: str) -> None:
     axes.set_xscale("log")
-    axes.set_xlim(*dataset[name].values[[0, -1]])
-    axes.set_xlabel(_LABELS[name])
+    low, high = dataset[name].values[[0, -1]]
+    axes.set_xlim(low / 1.05, high * 1.05)
+    axes.set_xlabel(LABELS[name])
     axes.set_ylabel(label)
 
 
 def _energy(stiffness: str) -> Draw:
     def draw(axes: Axes, dataset: xr.Dataset) -> None:
-        for law, colour, dashes in _styles(dataset):
+        for law, style in _styles(dataset):
             one = dataset.sel(law=law)
             worst = one["energy_out"].max(STRIKES).values * 1e6
             chatters = one["chatters"].any(STRIKES).values
             x = one[stiffness].values
-            axes.plot(x, worst, dashes, color=colour, label=law)
-            axes.plot(x[chatters], worst[chatters], "x", color=colour, ms=4)
+            axes.plot(x, worst, label=law, **style | {"marker": ""})
+            axes.plot(x[chatters], worst[chatters], "x", color=style["color"], ms=4)
         # One count times the peak torque: what the encoder cannot tell.
         tolerance = dataset["energy_tolerance"].max((*STRIKES, "law")).values * 1e6
-        axes.plot(dataset[stiffness].values, tolerance, color="0.4", lw=0.8, label="1 count × peak")
+        axes.plot(
+            dataset[stiffness].values,
+            tolerance,
+            color="0.4",
+            lw=0.8,
+            label="one encoder count × peak torque",
+        )
         axes.set_yscale("symlog", linthresh=1.0)
-        axes.set_ylim(bottom=0.0)
+        axes.set_ylim(bottom=-0.1)
         _over_stiffness(axes, dataset, stiffness, "energy out, worst strike [µJ] (×: chatters)")
 
     return draw
@@ -197,11 +204,12 @@ def _energy(stiffness: str) -> Draw:
 
 def _chatter(stiffness: str) -> Draw:
     def draw(axes: Axes, dataset: xr.Dataset) -> None:
-        for law, colour, dashes in _styles(dataset):
+        for law, style in _styles(dataset):
             worst = dataset["amplitude"].sel(law=law).max(STRIKES).values * 1e3
-            axes.plot(dataset[stiffness].values, worst, dashes, color=colour, label=law)
+            axes.plot(dataset[stiffness].values, worst, ms=3, mfc="none", label=law, **style)
         axes.set_yscale("symlog", linthresh=0.01)
-        axes.set_ylim(bottom=0.0)
+        # None is drawn as zero, and to be seen as that.
+        axes.set_ylim(bottom=-0.001)
         _over_stiffness(axes, dataset, stiffness, "amplitude of chatter, worst strike [mrad]")
 
     return draw
@@ -209,75 +217,14 @@ def _chatter(stiffness: str) -> Draw:
 
 def _frequency(stiffness: str) -> Draw:
     def draw(axes: Axes, dataset: xr.Dataset) -> None:
-        for law, colour, _ in _styles(dataset):
+        for law, style in _styles(dataset):
             found = dataset["frequency"].sel(law=law).transpose(stiffness, ...).values
             found = found.reshape(len(found), -1)
             x = np.repeat(dataset[stiffness].values, found.shape[1])
             seen = found.ravel() > 0.0
-            axes.plot(x[seen], found.ravel()[seen], ".", color=colour, ms=4, label=law)
+            points = style | {"ls": "none", "mfc": "none", "ms": 4}
+            axes.plot(x[seen], found.ravel()[seen], label=law, **points)
+        axes.set_ylim(0.0, max(axes.get_ylim()[1], 10.0))
         _over_stiffness(axes, dataset, stiffness, "frequency of chatter, each strike [Hz]")
 
     return draw
-
-
-def _z_width(axes: Axes, dataset: xr.Dataset) -> None:
-    """Where no strike chatters, and the analytic limits over it."""
-    stiffness, damping = (_named(dataset, pair) for pair in (STIFFNESS, DAMPING))
-    mass, period = dataset["inertia"].item(), dataset["period"].item()
-    x_unit = mass / period**2 if stiffness == "stiffness_normalised" else 1.0
-    y_unit = mass / period if damping == "damping_normalised" else 1.0
-    chatters = dataset["chatters"].any(STRIKES).transpose(damping, stiffness).values
-    axes.pcolormesh(
-        dataset[stiffness].values,
-        dataset[damping].values,
-        np.where(chatters, 1.0, 0.0),
-        cmap=mpl.colors.ListedColormap(["#cfe8dc", "#f6d5c3"]),
-        vmin=0.0,
-        vmax=1.0,
-        shading="nearest",
-    )
-    axes.canwall_patches = (  # type: ignore[attr-defined]
-        Patch(color="#cfe8dc", label="no strike chatters"),
-        Patch(color="#f6d5c3", label="chatters"),
-    )
-    delay, viscous = dataset["loop_delay"].item(), dataset["viscous"].item()
-    low, high = dataset[damping].values[[0, -1]]
-    dampings = np.linspace(low, high, 60) * y_unit
-    lines: list[tuple[str, list[float]]] = [
-        (
-            "linear, small b·T/m: (b + B)/(T/2 + D·T)",
-            [delayed_stiffness(viscous, b, period, delay) for b in dampings],
-        )
-    ]
-    if delay == int(delay):
-        lines.append(
-            (
-                "linear, exact",
-                [stable_stiffness(mass, viscous, b, period, int(delay)) for b in dampings],
-            )
-        )
-    device = dataset["device_viscous"].item()
-    if delay in (0.0, 1.0):
-        lines.append(
-            (
-                "passive (Colgate, Schenkel; D)",
-                [passive_stiffness(device, b, period, int(delay)) for b in dampings],
-            )
-        )
-    if delay == 0.0:
-        limit = quantised_stiffness(
-            device, dataset["coulomb"].item(), dataset["count"].item(), period
-        )
-        lines.append(("passive, quantised (Abbott, Okamura; B = 0)", [limit] * 60))
-    axes.set_xscale("log")
-    box = dataset[stiffness].values[[0, -1]]
-    for (label, limits), colour, dashes in zip(lines, COLOURS[1:], _DASHES, strict=False):
-        axes.add_line(
-            Line2D(
-                np.array(limits) / x_unit, dampings / y_unit, color=colour, ls=dashes, label=label
-            )
-        )
-    axes.set_xlim(*box)
-    axes.set_ylim(low, high)
-    axes.set_xlabel(_LABELS[stiffness])
-    axes.set_ylabel(_LABELS[damping])

@@ -1,0 +1,69 @@
+"""What the figures of a sweep say in words: axes, titles, circumstances."""
+
+import math
+
+import numpy as np
+import xarray as xr
+
+from canwall.sweep.axes import STRIKES
+
+#: An axis of a sweep as the label of a figure's.
+LABELS = {
+    "stiffness": "K [N·m/rad]",
+    "stiffness_normalised": "K·T²/m",
+    "damping": "B [N·m·s/rad]",
+    "damping_normalised": "B·T/m",
+    "rate": "rate of the SYNC [Hz]",
+    "delay": "delay D [cycles]",
+    "model_error": "relative error of the model's inertia",
+    "counts": "encoder [counts per turn]",
+    "torque_step": "torque step [N·m]",
+}
+#: An axis in the title of a panel.
+_TITLES = {
+    "stiffness": "K = {} N·m/rad",
+    "stiffness_normalised": "K·T²/m = {}",
+    "damping": "B = {} N·m·s/rad",
+    "damping_normalised": "B·T/m = {}",
+    "rate": "{} Hz",
+    "delay": "D = {}",
+    "model": "model: {}",
+    "operator": "operator: {}",
+}
+
+
+def named(dataset: xr.Dataset, names: tuple[str, ...]) -> str:
+    """Which of the names the dataset has."""
+    return next(name for name in names if name in dataset.coords)
+
+
+def panel_title(dataset: xr.Dataset, point: dict[str, int]) -> str:
+    """What tells a panel from the others; point: the place on each of its axes."""
+    parts = []
+    for name, place in point.items():
+        if dataset.sizes[name] > 1 or name in ("law", "operator"):
+            said = _TITLES.get(name, "{}" if name == "law" else f"{name} = {{}}")
+            value = dataset[name].values[place]
+            parts.append(said.format(value if isinstance(value, str) else f"{value:g}"))
+    return ", ".join(parts)
+
+
+def circumstances(dataset: xr.Dataset) -> str:
+    """What is the same for all panels, for whoever sees the picture alone."""
+    said = (
+        ("period", "T = {:g} ms", 1e3),
+        ("loop_delay", "D = {:g}", 1.0),
+        ("inertia", "m = {:.3g} kg·m²", 1.0),
+        ("viscous", "b = {:.3g} N·m·s/rad", 1.0),
+        ("coulomb", "f_c = {:.3g} N·m", 1.0),
+        ("count", "Δ = {:.3g} µrad", 1e6),
+        ("force_step", "torque step {:.3g} mN·m", 1e3),
+    )
+    parts = []
+    for name, text, scale in said:
+        values = np.unique(dataset[name].values)
+        if len(values) == 1:
+            parts.append(text.format(values[0] * scale))
+    strikes = math.prod(dataset.sizes[name] for name in STRIKES)
+    parts.append("1 strike" if strikes == 1 else f"the worst of {strikes} strikes")
+    return ", ".join(parts)

@@ -1,0 +1,151 @@
+"""The Z-width map: where no strike chatters, and the analytic limits over it (section 6)."""
+
+from dataclasses import dataclass
+
+import matplotlib as mpl
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from canwall.sweep.analytic import (
+    CEILINGS,
+    delayed_stiffness,
+    passive_stiffness,
+    quantised_stiffness,
+    stable_stiffness,
+)
+from canwall.sweep.axes import DAMPING, STIFFNESS, STRIKES
+from canwall.sweep.labels import LABELS, named
+
+Array = NDArray[np.float64]
+
+_FREE, _CHATTERS = "#cfe8dc", "#f6d5c3"
+#: Points of a line.
+_POINTS = 60
+
+
+@dataclass(frozen=True)
+class _Limit:
+    """A line of largest stiffnesses [N·m/rad] over the damping [N·m·s/rad]; or one point."""
+
+    label: str
+    stiffness: Array
+    damping: Array
+    colour: str
+    dashes: str = "-"
+    mark: str = "none"
+
+
+def draw_z_width(axes: Axes, dataset: xr.Dataset) -> None:
+    """The map of one condition, K over B, and the limits of a spring and damper with its plant."""
+    stiffness, damping = (named(dataset, pair) for pair in (STIFFNESS, DAMPING))
+    mass, period = dataset["inertia"].item(), dataset["period"].item()
+    x_unit = mass / period**2 if stiffness == "stiffness_normalised" else 1.0
+    y_unit = mass / period if damping == "damping_normalised" else 1.0
+    chatters = dataset["chatters"].any(STRIKES).transpose(damping, stiffness).values
+    axes.pcolormesh(
+        dataset[stiffness].values,
+        dataset[damping].values,
+        np.where(chatters, 1.0, 0.0),
+        cmap=mpl.colors.ListedColormap([_FREE, _CHATTERS]),
+        vmin=0.0,
+        vmax=1.0,
+        shading="nearest",
+    )
+    axes.canwall_patches = (  # type: ignore[attr-defined]
+        Patch(color=_FREE, label="no strike chatters"),
+        Patch(color=_CHATTERS, label="chatters"),
+    )
+    left, right = dataset[stiffness].values[[0, -1]]
+    low, high = dataset[damping].values[[0, -1]]
+    for limit in _limits(dataset, low * y_unit, high * y_unit):
+        x, y = limit.stiffness / x_unit, limit.damping / y_unit
+        is_point = len(x) == 1
+        if is_point and not (left <= x[0] <= right and low <= y[0] <= high):
+            continue
+        axes.add_line(
+            Line2D(
+                x,
+                y,
+                color=limit.colour,
+                ls=limit.dashes,
+                marker=limit.mark,
+                ms=7,
+                # A point on the edge is seen whole.
+                clip_on=not is_point,
+                zorder=3,
+                label=limit.label,
+            )
+        )
+    axes.set_xscale("log")
+    axes.set_xlim(left, right)
+    axes.set_ylim(low, high)
+    axes.set_xlabel(LABELS[stiffness])
+    axes.set_ylabel(LABELS[damping])
+
+
+def _limits(dataset: xr.Dataset, low: float, high: float) -> list[_Limit]:
+    """Those that are known for the delay of the map, over dampings from low to high."""
+    mass, viscous, device, period, delay = (
+        dataset[name].item()
+        for name in ("inertia", "viscous", "device_viscous", "period", "loop_delay")
+    )
+    # Passivity ends where B comes to the device's own damping: that may be a small part of the map.
+    fine = np.linspace(0.0, device, _POINTS // 3)
+    dampings = np.linspace(low, high, _POINTS)
+    dampings = np.unique(np.concatenate((dampings, fine[(low <= fine) & (fine <= high)])))
+    approximate = [delayed_stiffness(viscous, b, period, delay) for b in dampings]
+    found = [
+        _Limit(
+            "spring and damper: (b + B)/(T/2 + D·T)",
+            np.array(approximate),
+            dampings,
+            "#0072B2",
+        )
+    ]
+    if delay not in CEILINGS and delay != int(delay):
+        return found
+    whole = int(delay)
+    exact = [stable_stiffness(mass, viscous, b, period, whole) for b in dampings]
+    found.append(_Limit("the same, exact", np.array(exact), dampings, "#000000", "--"))
+    if whole in CEILINGS:
+        ceiling, at = CEILINGS[whole]
+        found.append(
+            _Limit(
+                "the same, ceiling at b = 0",
+                np.array([ceiling * mass / period**2]),
+                np.array([at * mass / period]),
+                "#000000",
+                "none",
+                "*",
+            )
+        )
+    if whole in (0, 1):
+        passive = [passive_stiffness(device, b, period, whole) for b in dampings]
+        found.append(
+            _Limit(
+                "passive with any operator (Colgate, Schenkel)",
+                np.array(passive),
+                dampings,
+                "#CC79A7",
+                "-.",
+            )
+        )
+    if whole == 0 and low == 0.0:
+        limit = quantised_stiffness(
+            device, dataset["coulomb"].item(), dataset["count"].item(), period
+        )
+        found.append(
+            _Limit(
+                "passive with encoder, B = 0 (Abbott, Okamura)",
+                np.array([limit]),
+                np.array([0.0]),
+                "#D55E00",
+                "none",
+                "^",
+            )
+        )
+    return found

@@ -1,0 +1,140 @@
+"""The figures of a sweep, drawn from its file alone."""
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib.image
+import numpy as np
+import pytest
+import xarray as xr
+from commands import command
+from matplotlib.figure import Figure
+from rig import settings_with
+
+from canwall.errors import InputError
+from canwall.sweep import make_plan, read_sweep, sweep
+from canwall.sweep.analytic import CEILINGS, delayed_stiffness, stable_stiffness
+from canwall.sweep.figures import write_sweep_figures
+
+STRIKE: dict[str, Any] = {"speed": [1.0], "phase": [0.0, 0.5], "press": 0.3}
+
+
+def swept(path: Path, **axes: Any) -> xr.Dataset:
+    return sweep(make_plan(settings_with(), {**STRIKE, **axes}), path)
+
+
+@pytest.fixture(scope="module")
+def z_width(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("map") / "map.nc"
+    swept(
+        path,
+        law=["damped", "half_sample"],
+        operator="none",
+        delay=[0, 1],
+        stiffness="0.3:100:12",
+        damping="0:0.06:5",
+    )
+    return path
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> dict[str, Figure]:
+    figures: dict[str, Figure] = {}
+    monkeypatch.setattr(Figure, "savefig", lambda self, path: figures.__setitem__(path.stem, self))
+    return figures
+
+
+def line(figure: Figure, panel: int, label: str) -> np.ndarray[Any, np.dtype[np.float64]]:
+    (found,) = (one for one in figure.axes[panel].get_lines() if one.get_label() == label)
+    return np.asarray(found.get_xydata())
+
+
+def test_every_picture_of_a_map_is_written(z_width: Path) -> None:
+    done = command("plot", z_width)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert [Path(word).name for word in done.stdout.split()] == [
+        f"map-{name}.png" for name in ("energy", "amplitude", "frequency", "z-width")
+    ]
+    for word in done.stdout.split():
+        height, width, _ = matplotlib.image.imread(word).shape
+        assert width > 900
+        assert height > 400
+
+
+def test_a_map_has_a_panel_for_each_condition_and_the_limits_in_it(
+    z_width: Path, drawn: dict[str, Figure]
+) -> None:
+    write_sweep_figures(read_sweep(z_width), z_width.with_suffix(""))
+    figure = drawn["map-z-width"]
+    assert [axes.get_title("left") for axes in figure.axes] == [
+        "damped, operator: none, D = 0",
+        "damped, operator: none, D = 1",
+        "half_sample, operator: none, D = 0",
+        "half_sample, operator: none, D = 1",
+    ]
+    for panel, delay in ((0, 0), (1, 1)):
+        for k, b in line(figure, panel, "the same, exact")[::20]:
+            assert k == stable_stiffness(1e-4, 5e-4, b, 1e-3, delay)
+        for k, b in line(figure, panel, "spring and damper: (b + B)/(T/2 + D·T)"):
+            assert k == delayed_stiffness(5e-4, b, 1e-3, delay)
+    ((k, b),) = line(figure, 1, "the same, ceiling at b = 0")
+    assert (k * 1e-6 / 1e-4, b * 1e-3 / 1e-4) == pytest.approx(CEILINGS[1])
+    ((k, b),) = line(figure, 0, "passive with encoder, B = 0 (Abbott, Okamura)")
+    assert (k, b) == (pytest.approx(1.0), 0.0)
+    # Coloured as the strikes have it.
+    for panel, (law, delay) in enumerate([("damped", 0), ("damped", 1)]):
+        chatters = read_sweep(z_width)["chatters"].sel(law=law, delay=delay, operator="none")
+        (mesh,) = figure.axes[panel].collections
+        shown = np.asarray(mesh.get_array()) > 0.5
+        np.testing.assert_array_equal(shown, chatters.any(("speed", "phase")).squeeze())
+        assert shown.any()
+        assert not shown.all()
+
+
+def test_energy_is_that_of_the_worst_strike(z_width: Path, drawn: dict[str, Figure]) -> None:
+    dataset = read_sweep(z_width)
+    write_sweep_figures(dataset, z_width.with_suffix(""))
+    there = dataset.sel(law="half_sample", delay=1, operator="none", damping=0.0)
+    shown = line(drawn["map-energy"], 1, "half_sample")
+    np.testing.assert_array_equal(shown[:, 0], dataset["stiffness"])
+    energy = there["energy_out"].squeeze().transpose("stiffness", "phase").values
+    worst = np.maximum(energy[:, 0], energy[:, 1])
+    np.testing.assert_allclose(shown[:, 1], worst * 1e6)
+
+
+def test_k_limits_over_the_rate(tmp_path: Path, drawn: dict[str, Figure]) -> None:
+    dataset = swept(
+        tmp_path / "rate.nc", law=["standard", "midpoint"], operator="finger", rate="400:1000:3"
+    )
+    write_sweep_figures(dataset, tmp_path / "rate")
+    figure = drawn["rate-limit-over-rate"]
+    for law in ("standard", "midpoint"):
+        shown = line(figure, 0, law)
+        np.testing.assert_array_equal(shown[:, 0], [400, 700, 1000])
+        worst = dataset["worst"].sel(law=law).squeeze() / 1.64e-4 / dataset["rate"] ** 2
+        np.testing.assert_allclose(shown[:, 1], worst)
+    linear = line(figure, 0, "spring and damper, linear, exact")
+    for rate, limit in linear:
+        exact = stable_stiffness(1.64e-4, 0.0261, 0.0, 1.0 / rate, 1)
+        assert limit == pytest.approx(exact / 1.64e-4 / rate**2, rel=1e-3)
+
+
+def test_limits_of_one_condition_and_what_cannot_be_drawn(tmp_path: Path) -> None:
+    limits = swept(tmp_path / "limits.nc", law=["standard", "midpoint"])
+    (path,) = write_sweep_figures(limits, tmp_path / "limits")
+    assert path.name == "limits-limits.png"
+    with pytest.raises(InputError, match="cannot be written"):
+        write_sweep_figures(limits, tmp_path / "nowhere" / "limits")
+    point = swept(tmp_path / "point.nc", stiffness=[10.0])
+    with pytest.raises(InputError, match="one point alone"):
+        write_sweep_figures(point, tmp_path / "point")
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no result"])
+def test_a_file_that_is_no_sweep(tmp_path: Path, content: bytes | None) -> None:
+    if content is not None:
+        (tmp_path / "a.nc").write_bytes(content)
+    done = command("plot", "a.nc", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith("canwall: a.nc: no result of a sweep")
+    assert len(done.stderr.splitlines()) == 1
