@@ -492,10 +492,10 @@ def _error(text: str) -> None:
 
 def main() -> NoReturn:
     """Entry point of the command `canwall`; ends the process with the exit code."""
-    sys.exit(_guarded(lambda: app(standalone_mode=False)))
+    sys.exit(guarded(lambda: app(standalone_mode=False)))
 
 
-def _guarded(command: Callable[[], object]) -> int:
+def guarded(command: Callable[[], object]) -> int:
     """Every error as one line; a traceback is a bug."""
     try:
         result = command()

@@ -274,7 +274,7 @@ def test_what_is_wrong_in_a_program_is_not_hidden(
 
     monkeypatch.setattr(canwall.run, "run_together", fail)
     with pytest.raises(ZeroDivisionError):
-        cli._guarded(lambda: cli.app(["run"], standalone_mode=False))
+        cli.guarded(lambda: cli.app(["run"], standalone_mode=False))
 
 
 # Progress

@@ -116,7 +116,7 @@ def run_with(folder: Path, toml: str, exchange: str) -> int:
     text = file.read_text().split("[[schedule]]")[0]
     file.write_text(text + toml)
     arguments = ["run", str(file), "--output", str(folder / "run")]
-    return cli._guarded(lambda: cli.app(arguments, standalone_mode=False))
+    return cli.guarded(lambda: cli.app(arguments, standalone_mode=False))
 
 
 def cycles_with(torque: "np.ndarray[tuple[int], np.dtype[np.int64]]", at: int) -> int:

@@ -31,14 +31,16 @@ def run(
     output: Path | None,
     report: Callable[[str], None] = lambda what: None,
     progress: Callable[[float, float | None], None] = lambda now_s, end_s: None,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> RunResult:
     """Enable the drive, render the wall, record, summarise, draw (`canwall run`).
 
-    report is told the steps, progress the seconds of bus time done and their end. Raises
-    ConfigError and DictionaryError before anything is enabled, DriveError where the drive cannot
-    be set up, RunFailedError where no cycle came about or none was recorded.
+    report is told the steps, progress the seconds of bus time done and their end; stopped is asked
+    whether to end the wall, besides the signals that do. Raises ConfigError and DictionaryError
+    before anything is enabled, DriveError where the drive cannot be set up, RunFailedError where
+    no cycle came about or none was recorded.
     """
-    (result,) = run_together([settings], output, report, progress)
+    (result,) = run_together([settings], output, report, progress, stopped)
     return result
 
 
@@ -47,6 +49,7 @@ def run_together(
     output: Path | None,
     report: Callable[[str], None] = lambda what: None,
     progress: Callable[[float, float | None], None] = lambda now_s, end_s: None,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> list[RunResult]:
     """`run` for several drives on one bus, each with its wall, on one SYNC.
 
@@ -87,7 +90,9 @@ def run_together(
                     scheduled(first) as scheduling,
                 ):
                     outcome = render(
-                        exchange, stop, lambda now_s: progress(now_s, first.run.duration_s)
+                        exchange,
+                        lambda: stop() or stopped(),
+                        lambda now_s: progress(now_s, first.run.duration_s),
                     )
         finally:
             notes = [recorder.close() for recorder in recorders]

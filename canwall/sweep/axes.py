@@ -185,7 +185,8 @@ def _overridden(settings: Settings, keys: Mapping[str, Any]) -> Settings:
         raise ConfigError(f"sweep axis {error}") from None
 
 
-def _with_law(settings: Settings, law: Value) -> Settings:
+def with_law(settings: Settings, law: Value) -> Settings:
+    """The wall rendered by that law, +deadbeat where it is compensated."""
     name = absolute_law(str(law), Path())
     deadbeat = name.endswith(DEADBEAT)
     wall: dict[str, Any] = {"law": name.removesuffix(DEADBEAT), "deadbeat": deadbeat}
@@ -248,7 +249,7 @@ def _with_operator(settings: Settings, name: Value) -> Settings:
 
 #: In the order in which they are made: a key of the configuration goes before all of them.
 _CHANGES: dict[str, Callable[[Settings, Value], Settings]] = {
-    "law": _with_law,
+    "law": with_law,
     "rate": _with_rate,
     "delay": _with_delay,
     "counts": _with_counts,

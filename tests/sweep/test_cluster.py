@@ -15,10 +15,10 @@ from canwall.sweep import read_sweep
 
 PATIENCE_S = 120.0
 
-#: Some ten seconds's work for one core: there is time to kill somebody.
+#: Some five seconds' work for one core: there is time to kill somebody.
 SWEEP = [
     *("sweep", SIM_CONFIG, "--law", "push_only", "--operator", "finger"),
-    *("--stiffness", "1:300:240", "--axis", "speed=0.5,0.7,1,1.4,2", "--axis", "phase=0:0.75:4"),
+    *("--stiffness", "1:300:120", "--axis", "speed=0.5,0.7,1,1.4,2", "--axis", "phase=0:0.75:4"),
 ]
 
 
