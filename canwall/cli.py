@@ -1,6 +1,7 @@
 """The commands, thin: options in, one call, tables and error lines out."""
 
 import math
+import os
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -207,6 +208,61 @@ def doctor(
     finally:
         _show_findings(findings)
     return 0 if findings.well else FAILED
+
+
+@app.command()
+def latency(
+    config_file: _ConfigArgument = None,
+    duration: Annotated[
+        float, typer.Option(min=0.1, help="Seconds of each part: idle, and under load.")
+    ] = 10.0,
+    load: Annotated[
+        int | None,
+        typer.Option(min=0, help="Processes that compute meanwhile; without: one per core."),
+    ] = None,
+    threads: Annotated[
+        int, typer.Option(min=0, help="Python threads of the same process that compute as well.")
+    ] = 0,
+    exchange: Annotated[
+        str | None, typer.Option(help="native, python-can or auto, instead of bus.exchange.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder for picture, histograms and numbers.")
+    ] = None,
+    eds: _EdsOption = None,
+    accept_no_watchdog: _NoWatchdogOption = False,
+) -> int:
+    """How well the cycle keeps to the clock on the bus of CONFIG, and what cycle is held.
+
+    SYNC, TPDO and RPDO go as in a run, idle and then under load, but the drive is not enabled and
+    gets zero torque. What was changed is put back.
+    """
+    settings = _settings(
+        config_file,
+        bus__exchange=exchange,
+        drive__eds=_absolute(eds),
+        drive__accept_no_watchdog=accept_no_watchdog or None,
+    )
+    from canwall.bench import measure_latency
+    from canwall.bench.latency_sheet import lines, write_latency
+    from canwall.run import stop_on_signals
+
+    processes = os.cpu_count() or 1 if load is None else load
+    with _RunProgress() as shown, stop_on_signals() as stop:
+        found = measure_latency(
+            settings, duration, processes, threads, stop, shown.report, shown.part
+        )
+    if found is None:
+        raise _InterruptedError("interrupted; the drive is as it was")
+    for line in lines(found):
+        _console.print(line, soft_wrap=True, highlight=False, markup=False)
+    if output is not None:
+        for path in write_latency(found, output):
+            _console.print(str(path), soft_wrap=True, highlight=False)
+    for note in found.notes:
+        _error(note)
+    _console.print(found.verdict.text, soft_wrap=True, highlight=False, markup=False)
+    return 0
 
 
 def _show_findings(findings: "Findings") -> None:
@@ -448,6 +504,11 @@ class _RunProgress:
     def advance(self, now_s: float, end_s: float | None) -> None:
         clock = f"{now_s:.1f} s" if end_s is None else f"{now_s:.1f} of {end_s:g} s"
         self._progress.update(self._task, completed=now_s, total=end_s, clock=clock)
+
+    def part(self, what: str, now_s: float, end_s: float) -> None:
+        """So many seconds of so many, of a part that has a name."""
+        self.report(what)
+        self.advance(now_s, end_s)
 
     def count(self, what: str, done: int, total: int) -> None:
         """So many steps of so many."""

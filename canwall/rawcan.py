@@ -61,7 +61,7 @@ _DONTWAIT = int(socket.MSG_DONTWAIT)
 _SEND_FLAGS = int(socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
 _SOL_SOCKET = socket.SOL_SOCKET
 #: asm-generic/socket.h; the option is also the type of the control message.
-SO_TIMESTAMPING = 37
+SO_TIMESTAMPING, SO_TIMESTAMPNS = 37, 35
 #: linux/net_tstamp.h: stamps when the driver hands a frame to the kernel, by CLOCK_REALTIME.
 RX_SOFTWARE_STAMPS = 1 << 3 | 1 << 4
 
@@ -167,8 +167,11 @@ def wait_readable(port: Record, descriptor: int, timeout_ns: int) -> bool:
 def _stamp(port: Record) -> int:
     """The kernel's time stamp in the control message [ns]; 0: there is none."""
     control = port.control
-    # struct cmsghdr: length, then level and type; the first of three stamps is the kernel's.
-    if port.msghdr[0].control_length < 32 or control[1] != _SOL_SOCKET | SO_TIMESTAMPING << 32:
+    # struct cmsghdr: length, then level and type; then one stamp, or three, the first the kernel's.
+    if port.msghdr[0].control_length < 32:
+        return 0
+    kind, level = control[1] >> 32, control[1] & 0xFFFFFFFF
+    if level != _SOL_SOCKET or (kind != SO_TIMESTAMPING and kind != SO_TIMESTAMPNS):
         return 0
     return control[2] * _NS_PER_S + control[3]
 
@@ -177,7 +180,8 @@ def _stamp(port: Record) -> int:
 def receive(port: Record, descriptor: int, stamped: bool) -> int:
     """Take a frame that is there into `port.frame`: FRAME, NOTHING, CLOSED or FAILED.
 
-    With `stamped`, of a socket with SO_TIMESTAMPING, `port.stamp_ns` is when it came.
+    With `stamped`, of a socket with SO_TIMESTAMPING or SO_TIMESTAMPNS, `port.stamp_ns` is when it
+    came.
     """
     port.stamp_ns = 0
     if stamped:

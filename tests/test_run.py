@@ -307,7 +307,8 @@ def assert_left_in_order(record: Record) -> None:
     assert last is not None
     _, statusword, torque = struct.unpack("<iHh", last)
     assert (statusword & 0x6F, torque) == (0x40, 0)
-    assert record.frames[-1].arbitration_id == RPDO1
+    ids = [frame.arbitration_id for frame in record.frames]
+    assert next(i for i in reversed(ids) if i in (SYNC, TPDO1, RPDO1)) == RPDO1
     assert len(record.cycles) == record.signals.num_rows == record.summary["cycles"]
     assert record.column("j").tolist() == list(range(len(record.cycles)))
     assert np.abs(record.column("torque_cmd_per_mille")).max() > 0

@@ -19,7 +19,7 @@ from canwall.cycle.step import (
     step,
 )
 from canwall.cycle.sync import ExternalSync, ProducedSync
-from canwall.cycle.timing import HISTOGRAM, observe_ns, percentile_ns, timing_summary
+from canwall.cycle.timing import HISTOGRAM, buckets_ns, observe_ns, percentile_ns, timing_summary
 from canwall.cycle.watch import Watch
 
 __all__ = [
@@ -36,6 +36,7 @@ __all__ = [
     "PythonCanExchange",
     "Trip",
     "Watch",
+    "buckets_ns",
     "fade_in",
     "make_cycle",
     "measured_delay",

@@ -47,7 +47,8 @@ class Axis:
     def __post_init__(self) -> None:
         self.cycle: NDArray[np.void] = make_cycle(self.settings, self.setup, self.laws)
         self.row = np.zeros(1, ROW)
-        self.latency = np.zeros(1, HISTOGRAM)
+        #: From a TPDO to its RPDO, and from the instant at which the SYNC was due to the RPDO.
+        self.latency, self.sync_to_rpdo = np.zeros(1, HISTOGRAM), np.zeros(1, HISTOGRAM)
         given = self.settings.estimator.delay_cycles
         self.delay = SYNCHRONOUS_DELAY if given is None else given
         self.wall, self.limits = self.settings.wall, self.settings.limits

@@ -5,6 +5,7 @@ end the wall, while the python-can bus keeps all others: SDO, NMT, heartbeats of
 between two ends or processes that carries the same packets lends its own descriptor.
 """
 
+import contextlib
 import errno
 import os
 import socket
@@ -14,7 +15,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import can
 
-from canwall.rawcan import RX_SOFTWARE_STAMPS, SO_TIMESTAMPING
+from canwall.rawcan import RX_SOFTWARE_STAMPS, SO_TIMESTAMPING, SO_TIMESTAMPNS
 
 _STANDARD = 0x7FF
 _EFF, _RTR, _INVERTED = 1 << 31, 1 << 30, 1 << 29
@@ -35,18 +36,27 @@ class FrameSocket(Protocol):
 class CyclicSocket:
     """What compiled code sends to and receives from."""
 
-    def __init__(self, bus: can.BusABC, received: Iterable[int], sent: Iterable[int]) -> None:
+    def __init__(
+        self,
+        bus: can.BusABC,
+        received: Iterable[int],
+        sent: Iterable[int],
+        stamps: bool = False,
+    ) -> None:
         """Open it, or borrow that of the bus.
 
         received, sent: CAN-IDs of what the cycle takes and gives; on SocketCAN the bus does not
-        hear them any more. Raises can.CanInitializationError where the bus has nothing to offer.
+        hear them any more. stamps: whether a borrowed one is to give the kernel's time stamps,
+        which a socket of its own always does. Raises can.CanInitializationError where the bus has
+        nothing to offer.
         """
         self._bus = bus
         self._own: socket.socket | None = None
         #: Whether its frames have the kernel's time stamps.
         self.stamped = False
         if isinstance(bus, FrameSocket):
-            self.descriptor = self._borrowed()
+            self._stamps = stamps
+            self._borrow()
         elif type(bus).__module__.startswith("can.interfaces.socketcan"):
             self._own = _open(str(bus.channel), received)  # type: ignore[attr-defined]
             self.descriptor = self._own.fileno()
@@ -57,7 +67,12 @@ class CyclicSocket:
                 "the native exchange needs SocketCAN or unixcan; use bus.exchange = 'python-can'"
             )
 
-    def _borrowed(self) -> int:
+    @property
+    def own(self) -> bool:
+        """Whether it is a socket beside that of the bus."""
+        return self._own is not None
+
+    def _borrow(self) -> None:
         assert isinstance(self._bus, FrameSocket)
         descriptor = self._bus.frame_descriptor()
         if descriptor is None:
@@ -66,7 +81,15 @@ class CyclicSocket:
                 "which compiled code does not; start the drive first, or use "
                 "bus.exchange = 'python-can'"
             )
-        return descriptor
+        self._take(descriptor)
+
+    def _take(self, descriptor: int) -> None:
+        """Use a descriptor of the bus; its packets are stamped as their sender hands them over."""
+        self.descriptor = descriptor
+        if self._stamps:
+            with contextlib.suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as sock:
+                sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+                self.stamped = True
 
     def renew(self) -> bool:
         """Look again after the other side has gone; whether there is somebody to talk to."""
@@ -76,7 +99,7 @@ class CyclicSocket:
         descriptor = self._bus.frame_descriptor()
         if descriptor is None:
             return False
-        self.descriptor = descriptor
+        self._take(descriptor)
         return True
 
     def close(self) -> None:

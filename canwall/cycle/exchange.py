@@ -46,10 +46,12 @@ class Exchange(ABC):
         self.axes = axes
         self._real_time = real_time
         self._period_s = float(axes[0].cycle["period"][0])
+        self._period_ns = round(self._period_s * 1e9)
         window_s = self._period_s * _SYNCHRONOUS_WINDOW
         self._timeout_s = window_s if real_time else _SIMULATED_TIMEOUT_S
         self._missing_timeout_s = min(self._timeout_s, _MISSING_TIMEOUT_S)
-        self.sync_interval = np.zeros(1, HISTOGRAM)
+        #: Intervals of the SYNC, and how far each is from its period.
+        self.sync_interval, self.sync_error = np.zeros(1, HISTOGRAM), np.zeros(1, HISTOGRAM)
         #: Whether simulated time waits for the writer of the record; False once it is gone.
         self.waits_for_writer = True
         for axis in axes:
@@ -120,6 +122,8 @@ class PythonCanExchange(Exchange):
         }
         self._beats = Beats(link, (axis.setup.watchdog for axis in axes))
         self._last_sync_ns = 0
+        #: Whether a message's time stamp is the kernel's, by the clock of time.time.
+        self._stamped = type(link.bus).__module__.startswith("can.interfaces.socketcan")
 
     @property
     def last_sync_ns(self) -> int:
@@ -140,6 +144,8 @@ class PythonCanExchange(Exchange):
             received_ns = time.perf_counter_ns()
             if message is None:
                 break
+            if self._stamped:
+                received_ns -= max(0, time.time_ns() - round(message.timestamp * 1e9))
             axis = awaited.pop(message.arbitration_id)
             # A TPDO that is too short does not carry what was mapped: as good as none.
             complete = len(message.data) >= axis.setup.tpdo.length
@@ -160,6 +166,7 @@ class PythonCanExchange(Exchange):
         interval = sync_ns - self._last_sync_ns if self._last_sync_ns else 0
         if interval:
             observe_ns(self.sync_interval, interval)
+            observe_ns(self.sync_error, abs(interval - self._period_ns))
         self._last_sync_ns = sync_ns
         return interval * 1e-9
 
@@ -178,6 +185,7 @@ class PythonCanExchange(Exchange):
         row["sync_interval_s"] = interval_s
         row["latency_s"] = latency * 1e-9
         if self._real_time:
+            observe_ns(axis.sync_to_rpdo, sent_ns - self._sync.deadline_ns + self._period_ns)
             late = sent_ns > self._sync.deadline_ns
             axis.late_rpdo += late
             axis.late_in_a_row = axis.late_in_a_row + 1 if late else 0

@@ -1,7 +1,8 @@
 """The loop: enable, render, leave. One way in and one way out, whatever happens in between.
 
 Every exit (time is up, Ctrl-C, a trip, an exception, a bus that fails) goes through `_leave`:
-torque zero from the very next RPDO, then the CiA 402 state machine down to SWITCH ON DISABLED.
+torque zero from the very next RPDO, then the CiA 402 state machine down to SWITCH ON DISABLED, and
+only then the drive's watchdog off, which would miss its master.
 With several axes, what ends one ends all.
 """
 
@@ -23,6 +24,7 @@ from canwall.drive import (
     State,
     controlword_down,
     disable,
+    disarm,
     state_of,
     status_text,
 )
@@ -54,6 +56,8 @@ class Outcome:
     trip_cycle: int | None = None
     """The cycle at which a limit was passed, or a report ended the wall."""
     disabled: bool = False
+    notes: list[str] = field(default_factory=list)
+    """What the drives would not do on the way out though they are disabled."""
 
 
 class _WallGivenUpError(Exception):
@@ -88,6 +92,8 @@ def run_loop(
     finally:
         try:
             _leave(loop, outcome)
+            if outcome.disabled:
+                outcome.notes = loop.disarm()
         finally:
             gc.enable()
             gc.unfreeze()
@@ -276,6 +282,17 @@ class _Loop:
                 failed = error
         if failed is not None:
             raise failed
+
+    def disarm(self) -> list[str]:
+        """The watchdogs off; what drives say that would not have it, and will miss their master."""
+        refused = []
+        for axis in self._axes:
+            try:
+                disarm(axis.node, axis.setup.rpdo, axis.setup.watchdog)
+            except (DriveError, can.CanError) as error:
+                stays = f"the drive's watchdog ({axis.setup.watchdog.kind}) stays set: {error}"
+                refused.append(self._say(axis, stays))
+        return refused
 
     def reset(self) -> bool:
         """The last resort: a drive that boots gives no torque. Whether the frames went out."""

@@ -30,6 +30,9 @@ from canwall.drive.watchdog import Beat
 from canwall.rawcan import CFunction, place_port
 from canwall.record.ring import FRAME, HEADER, RECEIVED, Ring, to_message
 
+#: A drive that answers within this time after a SYNC is awaited awake.
+LOOK_NS = 30_000
+
 _EMCY, _ERROR_CONTROL = 0x080, 0x700
 _PDOS = range(0x180, 0x580)
 #: A full transmit buffer is waited for no longer than this in simulated time, and so much of a
@@ -77,6 +80,7 @@ class NativeExchange(Exchange):
             link.bus,
             received=[*tpdos, *np.flatnonzero(treatment).tolist()],
             sent=[setup.sync_cob_id, *rpdos, *(beat.can_id for beat in beats)],
+            stamps=real_time,
         )
         self._inbox = _FrameRing(INBOX)
         self._unseen = _FrameRing(INBOX)
@@ -92,9 +96,11 @@ class NativeExchange(Exchange):
         exchange["sync_id"] = setup.sync_cob_id
         exchange["sync_overflow"] = setup.sync_counter_overflow
         exchange["sync_patience_ns"] = _ns(sync_patience_s(self._period_s))
-        exchange["period_ns"] = _ns(self._period_s)
+        exchange["period_ns"] = self._period_ns
         exchange["sync_interval"] = self.sync_interval.ctypes.data
+        exchange["sync_error"] = self.sync_error.ctypes.data
         exchange["timeout_ns"] = _ns(self._timeout_s)
+        exchange["look_ns"] = LOOK_NS
         exchange["missing_timeout_ns"] = _ns(self._missing_timeout_s)
         exchange["axes"], exchange["axes_length"] = self._frames.ctypes.data, len(axes)
         exchange["beats"], exchange["beats_length"] = self._beats.ctypes.data, len(beats)
@@ -115,6 +121,15 @@ class NativeExchange(Exchange):
     def last_sync_ns(self) -> int:
         """When the latest SYNC was, by time.perf_counter_ns; 0: there was none yet."""
         return int(self._exchange["last_sync_ns"][0])
+
+    @property
+    def look_ns(self) -> int:
+        """How long after a SYNC the TPDOs are looked for awake, before the wait is a sleep [ns]."""
+        return int(self._exchange["look_ns"][0])
+
+    @look_ns.setter
+    def look_ns(self, look_ns: int) -> None:
+        self._exchange["look_ns"] = look_ns
 
     @property
     def descriptor(self) -> int:
@@ -149,7 +164,7 @@ class NativeExchange(Exchange):
             elif result != Result.SEEN_FIRST:
                 self._give_up(result)
         self._tell_axes()
-        if self._socket.stamped:
+        if self._socket.own:
             while self._link.serve(0.0):
                 pass
 
@@ -222,6 +237,7 @@ def _axis_records(axes: Sequence[Axis]) -> NDArray[np.void]:
             ("cycle", axis.cycle),
             ("row", axis.row),
             ("latency", axis.latency),
+            ("sync_to_rpdo", axis.sync_to_rpdo),
             ("header", axis.ring.header),
             ("rows", axis.ring.rows),
         ):

@@ -73,8 +73,6 @@ _OPERATIONAL = 5
 #: How a CAN-ID is to be treated: seen at once, or only if it tells of another NMT state; seen by
 #: nobody, only logged. 0: seen between two cycles.
 AT_ONCE, UNLESS_OPERATIONAL, UNSEEN = 1, 2, 3
-#: This long after a SYNC the bus is looked at awake.
-_LOOK_NS = 30_000
 #: Frames that wait for Python between two looks of it.
 INBOX = 1 << 12
 _BITS_OFF = ~np.uint32(_CAN_EFF | CAN_RTR | _CAN_ERR)
@@ -90,6 +88,7 @@ AXIS = np.dtype(
         ("cycle", "u8"),
         ("row", "u8"),
         ("latency", "u8"),
+        ("sync_to_rpdo", "u8"),
         ("header", "u8"),
         ("rows", "u8"),
         ("awaited", "?"),
@@ -122,9 +121,11 @@ EXCHANGE = np.dtype(
         ("last_sync_ns", "i8"),
         ("sync_interval_s", "f8"),
         ("sync_interval", "u8"),
+        ("sync_error", "u8"),
         # TPDOs
         ("timeout_ns", "i8"),
         ("missing_timeout_ns", "i8"),
+        ("look_ns", "i8"),  # this long after a SYNC the bus is looked at awake
         ("stage", "i8"),
         ("left", "i8"),  # cycles that are still to be done in this call
         ("strikes", "i8"),
@@ -177,10 +178,6 @@ def _note(exchange: Record, received: int) -> None:
     """Log the frame in the port; received: RECEIVED, or 0 for one that was sent."""
     port = exchange.port[0]
     frame = port.frame[0]
-    flags = received
-    flags |= REMOTE if frame.can_id & CAN_RTR else 0
-    flags |= ERROR if frame.can_id & _CAN_ERR else 0
-    flags |= EXTENDED if frame.can_id & _CAN_EFF else 0
     if exchange.log_header:
         stamp_ns = port.stamp_ns if received and port.stamp_ns else wall_clock_ns(port)
         put_frame(
@@ -303,6 +300,7 @@ def _begin(exchange: Record, sync_ns: int) -> None:
     interval = sync_ns - exchange.last_sync_ns if exchange.last_sync_ns else 0
     if interval:
         observe_ns(elements(exchange.sync_interval, 1, HISTOGRAM), interval)
+        observe_ns(elements(exchange.sync_error, 1, HISTOGRAM), abs(interval - exchange.period_ns))
     exchange.last_sync_ns = sync_ns
     exchange.sync_interval_s = interval * 1e-9
     timeout = exchange.timeout_ns
@@ -340,6 +338,8 @@ def _answer(exchange: Record, axis: Record, data: int, received: bool, received_
     row.sync_interval_s = exchange.sync_interval_s
     row.latency_s = (sent_ns - received_ns) * 1e-9
     if exchange.real_time:
+        since_due = sent_ns - exchange.deadline_ns + exchange.period_ns
+        observe_ns(elements(axis.sync_to_rpdo, 1, HISTOGRAM), since_due)
         late = sent_ns > exchange.deadline_ns
         axis.late_rpdo += late
         axis.late_in_a_row = axis.late_in_a_row + 1 if late else 0
@@ -477,7 +477,7 @@ def _nothing_came(exchange: Record) -> int:
         return _DONE if _give_up_waiting(exchange) else _ERRNO
     if not exchange.idle:
         # A drive that answers at once is not worth a sleep, which costs more than its answer.
-        if now_ns(port) - exchange.looked_ns > _LOOK_NS:
+        if now_ns(port) - exchange.looked_ns > exchange.look_ns:
             wait_readable(port, exchange.descriptor, left_ns)
     elif not exchange.idle_function or not _call_idle(exchange.idle_function, exchange.idle_state):
         return _IDLE

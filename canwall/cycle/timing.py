@@ -38,9 +38,20 @@ def percentile_ns(histogram: NDArray[np.void], percent: float) -> float:
     if total == 0:
         return 0.0
     bucket = int(np.searchsorted(np.cumsum(counts), np.ceil(total * percent / 100.0)))
+    return min(float(_upper_ns(bucket)), float(histogram["largest_ns"][0]))
+
+
+def buckets_ns(histogram: NDArray[np.void]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Upper ends [ns], inclusive, of the buckets that are not empty, and how many are in each."""
+    used = np.flatnonzero(histogram["counts"][0])
+    ends = np.array([_upper_ns(int(bucket)) for bucket in used], np.int64)
+    return ends, histogram["counts"][0][used].astype(np.int64)
+
+
+def _upper_ns(bucket: int) -> int:
+    """The longest duration that is counted in a bucket."""
     octave = max(bucket // _SUB - 1, 0)
-    upper = float((bucket - octave * _SUB + 1) << octave) - 1.0
-    return min(upper, float(histogram["largest_ns"][0]))
+    return ((bucket - octave * _SUB + 1) << octave) - 1
 
 
 def timing_summary(histogram: NDArray[np.void]) -> dict[str, float]:

@@ -17,7 +17,7 @@ from canwall.drive.masters import refuse_second_master
 from canwall.drive.node import DriveError, DriveNode
 from canwall.drive.pdo import Field, PdoLayout
 from canwall.drive.setup import REQUIRED_OBJECTS, DriveSetup, disable, set_up
-from canwall.drive.watchdog import NO_WATCHDOG, Beat, Watchdog
+from canwall.drive.watchdog import NO_WATCHDOG, Beat, Watchdog, disarm
 
 __all__ = [
     "NO_WATCHDOG",
@@ -36,6 +36,7 @@ __all__ = [
     "controlword_down",
     "controlword_up",
     "disable",
+    "disarm",
     "refuse_second_master",
     "set_up",
     "state_of",

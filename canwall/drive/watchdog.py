@@ -92,6 +92,30 @@ def arm(
     )
 
 
+def disarm(node: DriveNode, rpdo: PdoLayout, watchdog: Watchdog) -> None:
+    """Switch off what `arm` has set, for a drive that is disabled: it would miss its master.
+
+    In PRE-OPERATIONAL first, which ends the PDOs, and so the deadline of the RPDO, at once. What
+    `restore` has to undo stays known. Raises DriveError, can.CanError.
+    """
+    node.command("PRE-OPERATIONAL")
+    if watchdog.kind == "RPDO event timer":
+        with while_off(node, rpdo.communication):
+            node.write(rpdo.communication, _EVENT_TIMER, 0)
+    elif watchdog.kind == "consumer heartbeat" and watchdog.beat is not None:
+        master_id = watchdog.beat.can_id - _ERROR_CONTROL
+        for subindex in _heartbeat_entries(node):
+            if node.read(od.CONSUMER_HEARTBEAT_TIME, subindex) >> 16 == master_id:
+                node.write(od.CONSUMER_HEARTBEAT_TIME, subindex, 0)
+    elif watchdog.kind == "life guarding":
+        node.write(od.LIFE_TIME_FACTOR, 0, 0)
+        node.write(od.GUARD_TIME, 0, 0)
+
+
+def _heartbeat_entries(node: DriveNode) -> list[int]:
+    return [i for i in range(1, 128) if node.has(od.CONSUMER_HEARTBEAT_TIME, i)]
+
+
 def _rpdo_event_timer(
     node: DriveNode, rpdo: PdoLayout, time_ms: int
 ) -> tuple[float, Beat | None, float]:
@@ -105,7 +129,7 @@ def _rpdo_event_timer(
 def _consumer_heartbeat(
     node: DriveNode, time_ms: int, master_id: int
 ) -> tuple[float, Beat | None, float]:
-    entries = [i for i in range(1, 128) if node.has(od.CONSUMER_HEARTBEAT_TIME, i)]
+    entries = _heartbeat_entries(node)
     if not entries:
         raise DriveError("no 0x1016")
     present = {i: node.read(od.CONSUMER_HEARTBEAT_TIME, i) for i in entries}

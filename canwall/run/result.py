@@ -56,12 +56,21 @@ def result_of(
             **scheduling,
             "sync_interval": timing_summary(exchange.sync_interval),
             "tpdo_to_rpdo": timing_summary(axis.latency),
+            **(_by_the_clock(axis, exchange) if settings.real_time else {}),
         },
     }
     folder.summary.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     if outcome.trip_cycle is not None:
         folder.write_trip(signals, outcome.trip_cycle)
     return RunResult(folder, summary, outcome, notes, remarks)
+
+
+def _by_the_clock(axis: Axis, exchange: Exchange) -> dict[str, Any]:
+    """What there is in real time alone; an RPDO has until the next SYNC, which is a cycle."""
+    return {
+        "sync_error": timing_summary(exchange.sync_error),
+        "sync_to_rpdo": timing_summary(axis.sync_to_rpdo),
+    }
 
 
 def _recorded(folder: RunFolder, troubles: list[str]) -> pa.Table:

@@ -101,6 +101,7 @@ def run_together(
     for axis, folder, noted in zip(axes, folders, notes, strict=True):
         said = [*noted, *watch.notes] if axis is axes[0] else noted
         remarks = [*remarks_on(axis.setup, axis.settings), *not_restored.get(axis.name, [])]
+        remarks += outcome.notes if axis is axes[0] else []
         results.append(result_of(axis, exchange, watch, scheduling, folder, outcome, said, remarks))
     report("drawing")
     for folder in folders:

@@ -1,21 +1,18 @@
 /* Two ends of a cycle that do nothing but read, copy and write: the least that a cycle can cost.
 
-   frames DESCRIPTOR master CYCLES   SYNC, TPDO in, its data into an RPDO, RPDO out
-   frames DESCRIPTOR drive CYCLES    waits for SYNC, TPDO out, RPDO in; to standard output as
-                                     64-bit numbers: nanoseconds from TPDO to RPDO, each, and
-                                     from the first SYNC to the last RPDO */
+   frames DESCRIPTOR master CYCLES [awake]   SYNC, TPDO in, its data into an RPDO, RPDO out
+   frames DESCRIPTOR drive CYCLES [awake]    waits for SYNC, TPDO out, RPDO in; to standard output
+     as 64-bit numbers: nanoseconds from TPDO to RPDO, each, and from the first SYNC to the last RPDO
+   It waits in recv, or awake: it looks for a frame again and again. */
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/socket.h>
 #include <time.h>
-#include <unistd.h>
 
-struct frame {
-    uint32_t id;
-    uint8_t length, reserved[3], data[8];
-};
-
+struct frame { uint32_t id; uint8_t length, reserved[3], data[8]; };
+static int bus, flags;
 static int64_t now(void)
 {
     struct timespec t;
@@ -23,45 +20,41 @@ static int64_t now(void)
     return t.tv_sec * 1000000000LL + t.tv_nsec;
 }
 
-static void check(ssize_t size)
+static void put(const struct frame *f)
 {
-    if (size != sizeof(struct frame))
-        exit(1);
+    if (send(bus, f, sizeof *f, 0) != sizeof *f) exit(1);
 }
 
-static void master(int bus, long cycles)
+static void take(struct frame *f)
+{
+    ssize_t size;
+    while ((size = recv(bus, f, sizeof *f, flags)) < 0 && flags);
+    if (size != sizeof *f) exit(1);
+}
+
+static void master(long cycles)
 {
     struct frame sync = {.id = 0x080}, tpdo, rpdo = {.id = 0x205, .length = 4};
-    for (long j = 0; j < cycles; j++) {
-        check(write(bus, &sync, sizeof sync));
-        check(read(bus, &tpdo, sizeof tpdo));
-        memcpy(rpdo.data, tpdo.data, 4);
-        check(write(bus, &rpdo, sizeof rpdo));
-    }
+    for (long j = 0; j < cycles; j++)
+        put(&sync), take(&tpdo), memcpy(rpdo.data, tpdo.data, 4), put(&rpdo);
 }
 
-static void drive(int bus, long cycles)
+static void drive(long cycles)
 {
     struct frame in, tpdo = {.id = 0x185, .length = 8, .data = {0, 0x10, 0, 0, 0x37, 0x02, 0, 0}};
     int64_t *took = calloc(cycles + 1, sizeof *took), first = 0;
     for (long j = 0; j < cycles; j++) {
-        do
-            check(read(bus, &in, sizeof in));
-        while (in.id != 0x080);
+        do take(&in); while (in.id != 0x080);
         int64_t begin = now();
         first = j ? first : begin;
-        check(write(bus, &tpdo, sizeof tpdo));
-        check(read(bus, &in, sizeof in));
-        took[j] = now() - begin;
-        took[cycles] = begin + took[j] - first;
+        put(&tpdo), take(&in);
+        took[j] = now() - begin, took[cycles] = begin + took[j] - first;
     }
     fwrite(took, sizeof *took, cycles + 1, stdout);
 }
 
 int main(int count, char **arguments)
 {
-    int bus = atoi(arguments[1]);
-    long cycles = atol(arguments[3]);
-    (arguments[2][0] == 'm' ? master : drive)(bus, cycles);
-    return count != 4;
+    bus = atoi(arguments[1]), flags = count > 4 ? MSG_DONTWAIT : 0;
+    (arguments[2][0] == 'm' ? master : drive)(atol(arguments[3]));
 }

@@ -19,6 +19,7 @@ from canwall.record import Phase
 
 #: The hand strikes from cycle 200 on; by this one it rests on the wall and presses until 800.
 PRESSING = 500
+EMCY = 0x085
 UP, DOWN = [0x00, 0x06, 0x07, 0x0F], [0x07, 0x06, 0x00]
 
 
@@ -97,6 +98,50 @@ def test_torque_is_applied_by_the_sync_after_the_rpdo(make_rig: RigFactory) -> N
     rows = loop.rows()
     nm = loop.setup.units.nm_per_mille
     assert np.array_equal(rows["torque_applied"][1:], rows["torque_cmd_per_mille"][:-1] * nm)
+
+
+@pytest.mark.parametrize("kind", ["RPDO event timer", "consumer heartbeat", "life guarding"])
+def test_drive_that_is_disabled_does_not_miss_its_master(make_rig: RigFactory, kind: str) -> None:
+    rig = make_rig(pressing())
+    if kind != "RPDO event timer":
+        for index in range(0x1400, 0x1404):
+            del rig.node.dictionary[index].subindices[5]
+    if kind == "life guarding":
+        del rig.node.dictionary[0x1016]
+    for _ in range(2):  # and a second run is as good as the first
+        loop = Loop(rig)
+        assert loop.setup.watchdog.kind == kind
+        outcome = loop.run(PRESSING)
+        assert (outcome.trips, outcome.notes) == ([], [])
+        assert np.abs(loop.rows()["torque_cmd_per_mille"]).max() > 50
+        # Longer than any watchdog of simulated time.
+        assert [frame for frame in rig.tampering.tick(100.0) if frame[0] == EMCY] == []
+    assert rig.node.emergencies == []
+
+
+def test_watchdog_that_cannot_be_switched_off_is_said(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing()))
+    loop.rig.tampering.read_only[(0x1400, 5)] = 0x06010002
+    outcome = loop.run(PRESSING)
+    assert outcome.trips == []
+    assert outcome.disabled
+    (note,) = outcome.notes
+    assert note.startswith("the drive's watchdog (RPDO event timer) stays set: node 5: writing 0x0")
+
+
+def test_watchdog_stays_set_while_the_drive_may_give_torque(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing()))
+
+    def deafen(j: int) -> bool:
+        if j == PRESSING:
+            loop.rig.tampering.deaf.update((RPDO1, SDO_REQUEST, 0x000))
+        return j > 1000
+
+    outcome = loop.run(None, deafen)
+    assert not outcome.disabled
+    loop.rig.runner.poll()  # the last of what it does not hear: NMT RESET NODE
+    loop.rig.tampering.deaf.clear()
+    assert loop.rig.node.read(0x1400, 5) == 30_000
 
 
 def test_stopped_in_the_middle(make_rig: RigFactory) -> None:

@@ -1,0 +1,300 @@
+"""What `canwall latency` measures, what it makes of it, and that the drive stays as it was."""
+
+import csv
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from commands import COMMAND, Start, command, config_file, wait_for
+from matplotlib.image import imread
+
+import canwall.run
+from canwall import config, simdrive
+from canwall.bench import latency as latency_module
+from canwall.bench.budget import Budget, CyclicFrame, bus_budget
+from canwall.bench.latency import Histogram, Latency, Phase, measure_latency, verdict
+from canwall.bench.latency_sheet import QUANTITIES, lines, percentiles_us, write_latency
+from canwall.config import Settings
+from canwall.cycle import HISTOGRAM, observe_ns
+from canwall.errors import InputError, RunFailedError
+from canwall.run import StopRequest
+
+REAL_TIME = {"bus.interface": "socketcan", "bus.channel": "can0"}
+GRANTED = {"scheduling": "SCHED_FIFO, priority 45"}
+
+
+@pytest.fixture
+def drives(monkeypatch: pytest.MonkeyPatch) -> "list[Listening]":
+    """Every simulated drive that is made, and what it has heard."""
+    made: list[Listening] = []
+    make = canwall.run.make_simulated_drive
+
+    def listened(settings: Settings) -> simdrive.FaultyDrive:
+        drive = make(settings)
+        made.append(Listening(drive))
+        return drive
+
+    monkeypatch.setattr(canwall.run.buses, "make_simulated_drive", listened)
+    monkeypatch.setattr(latency_module, "_SETTLING_S", 0.02)
+    return made
+
+
+class Listening:
+    def __init__(self, drive: simdrive.FaultyDrive) -> None:
+        self.drive = drive
+        self._process = drive.process
+        self.heard: list[tuple[int, bytes]] = []
+        self.mute = False
+        drive.process = self._noted  # type: ignore[method-assign]
+
+    def _noted(self, can_id: int, data: bytes) -> list[simdrive.Frame]:
+        self.heard.append((can_id, data))
+        frames = self._process(can_id, data)
+        return [frame for frame in frames if not (self.mute and frame[0] == 0x185)]
+
+
+def settings_of(exchange: str, overrides: dict[str, Any] | None = None) -> Settings:
+    given = {"bus.exchange": exchange} | (overrides or {})
+    return config.load(config.shipped("config/sim.toml"), given)
+
+
+@pytest.mark.parametrize("exchange", ["python-can", "native"])
+def test_measured_without_torque_and_put_back(exchange: str, drives: list[Listening]) -> None:
+    told: list[tuple[str, float, float]] = []
+    found = measure_latency(
+        settings_of(exchange),
+        0.1,
+        1,
+        1,
+        StopRequest(),
+        progress=lambda *part: told.append(part),
+    )
+    assert found is not None
+    assert found.exchange == exchange
+    assert [phase.name for phase in found.phases] == ["idle", "load"]
+    for phase in found.phases:
+        assert phase.cycles == 100
+        for quantity in QUANTITIES:
+            assert quantity.of(phase).counts.sum() == 100
+        # From the SYNC to the RPDO there is the way from the TPDO to it.
+        assert phase.sync_to_rpdo.max_us >= phase.tpdo_to_rpdo.p50_us > 0.0
+    assert {name for name, _, _ in told} == {"idle", "load"}
+    assert all(0.0 <= now <= end == pytest.approx(0.1) for _, now, end in told)
+    (listening,) = drives
+    rpdos = {data for can_id, data in listening.heard if can_id == 0x205}
+    assert rpdos == {bytes(4)}  # neither enabled nor with a torque
+    assert found.notes == ()
+    upload = b"\x40\x00\x14\x05\0\0\0\0"  # the RPDO's event timer, a watchdog while it was measured
+    answers = [data for can_id, data in listening._process(0x605, upload) if can_id == 0x585]
+    assert answers[0][4:6] == b"\0\0"
+
+
+def test_drive_that_does_not_answer_the_sync(drives: list[Listening]) -> None:
+    def mute(what: str) -> None:
+        drives[0].mute = True
+
+    with pytest.raises(RunFailedError, match=r"no TPDO \(0x185\) for \d+ SYNCs"):
+        measure_latency(settings_of("python-can"), 0.1, 0, 0, StopRequest(), report=mute)
+
+
+def test_stopped_in_between(drives: list[Listening]) -> None:
+    stop = StopRequest()
+
+    def ask(what: str, now_s: float, end_s: float) -> None:
+        stop.requested = True
+
+    assert measure_latency(settings_of("native"), 60.0, 0, 0, stop, progress=ask) is None
+    (listening,) = drives
+    assert {data for can_id, data in listening.heard if can_id == 0x205} == {bytes(4)}
+
+
+# The verdict
+
+
+def histogram(*values_us: float) -> Histogram:
+    counted = np.zeros(1, HISTOGRAM)
+    for value in values_us:
+        observe_ns(counted, round(value * 1e3))
+    return Histogram.of(counted)
+
+
+def phase(name: str, sync_to_rpdo_us: float, missed: int = 0) -> Phase:
+    many = [histogram(*[value] * 1000) for value in (5.0, 10.0, sync_to_rpdo_us)]
+    return Phase(name, 1000, missed, 0, *many)
+
+
+def budget(settings: Settings) -> Budget:
+    frames = (CyclicFrame("TPDO", 0x185, 8),), (CyclicFrame("RPDO", 0x205, 4),)
+    sync = CyclicFrame("SYNC", 0x80, 0)
+    return bus_budget(sync, *frames, settings.bus.bitrate, settings.bus.cycle_s)
+
+
+def bench_settings(**bus: object) -> Settings:
+    given = REAL_TIME | {f"bus.{key}": value for key, value in bus.items()}
+    return config.load(config.shipped("config/sim.toml"), given)
+
+
+def test_bus_that_bounds_the_cycle() -> None:
+    settings = bench_settings(bitrate=125_000, cycle_s=0.005)
+    found = verdict([phase("idle", 200.0)], budget(settings), settings, GRANTED)
+    # 55 + 135 + 95 bits at worst, of which 80 % of the bus may be used.
+    bits = 55 + 135 + 95
+    assert budget(settings).bits == bits
+    assert found.by_bus_s == pytest.approx(bits / 125e3 / 0.8, rel=0.01)
+    assert found.holds_s == math.ceil(found.by_bus_s * 1e5) / 1e5
+    assert found.text.startswith("holds a cycle of 2.8")
+    assert "bound by the bus: a cycle has 285 bits, and 80% of 125 kbit/s" in found.text
+
+
+def test_machine_that_bounds_the_cycle() -> None:
+    settings = bench_settings()
+    parts = [phase("idle", 100.0), phase("load", 700.0)]
+    found = verdict(parts, budget(settings), settings, {"scheduling": "no real-time priority: …"})
+    assert found.by_machine_s == pytest.approx(700e-6 + 95e-6, rel=1 / 32)
+    assert found.holds_s >= found.by_machine_s
+    assert "(under load), most of it until the TPDO comes, without real-time priority" in found.text
+
+
+def test_bus_without_a_bit_rate_has_the_time_of_a_wire_added() -> None:
+    on_a_wire, without = bench_settings(), bench_settings(channel="vcan0")
+    both = [
+        verdict([phase("idle", 700.0)], budget(settings), settings, GRANTED).by_machine_s
+        for settings in (on_a_wire, without)
+    ]
+    assert both[1] - both[0] == pytest.approx((55 + 135) * 1e-6)
+
+
+def test_cycle_that_is_too_short() -> None:
+    settings = bench_settings()
+    parts = [phase("load", 1500.0)]
+    found = verdict(parts, budget(settings), settings, GRANTED)
+    assert found.text.startswith("does not hold 1 ms, but a cycle of 1.")
+    missing = verdict([phase("idle", 100.0, missed=20)], budget(settings), settings, GRANTED)
+    assert missing.holds_s == math.inf
+    assert missing.text.startswith("not even bus.cycle_s = 0.001 is held: 2.00% of the TPDOs")
+
+
+# What is shown and written
+
+
+def measured() -> Latency:
+    settings = bench_settings()
+    counted = [
+        Phase(
+            name,
+            4,
+            0,
+            1,
+            histogram(0.5, 3.0, 3.0, worst),
+            histogram(8.0, 9.0, 11.0, 12.0),
+            histogram(40.0, 45.0, 70.0, 1200.0),
+        )
+        for name, worst in (("idle", 4.0), ("load", 300.0))
+    ]
+    known = budget(settings)
+    found = verdict(counted, known, settings, GRANTED)
+    return Latency(
+        "socketcan",
+        "can0",
+        1_000_000,
+        0.001,
+        "native",
+        GRANTED,
+        "none",
+        tuple(counted),
+        known,
+        found,
+        (),
+    )
+
+
+def test_histograms_as_text() -> None:
+    text = list(lines(measured()))
+    error = [line.split() for line in text if line.startswith("       2 – 5")]
+    assert [word for word in error[0] if word.isdigit()][2:] == ["3", "2"]  # of idle, of load
+    # What is late has no margin left; it is in the same bins, from the next SYNC backwards.
+    late = next(line for line in text if line.startswith("   -1000 – 0"))
+    assert [word for word in late.split() if word.isdigit()][-2:] == ["1", "1"]
+    in_time = next(line for line in text if line.startswith("     950 – 980"))
+    assert [word for word in in_time.split() if word.isdigit()][2:] == ["2", "2"]
+    assert any("min -200.0" in line for line in text)
+
+
+def test_margin_is_what_is_left_of_the_period() -> None:
+    found = measured()
+    margin = percentiles_us(found, QUANTITIES[2], found.phases[0])
+    taken = found.phases[0].sync_to_rpdo
+    assert margin["p50"] == 1000.0 - taken.p50_us
+    assert margin["min"] == 1000.0 - 1200.0
+
+
+def test_files(tmp_path: Path) -> None:
+    found = measured()
+    paths = write_latency(found, tmp_path / "out")
+    assert [path.name for path in paths] == ["latency.json", "latency.csv", "latency.png"]
+    numbers = json.loads(paths[0].read_text())
+    assert numbers["verdict"] == found.verdict.text
+    assert numbers["phases"]["load"]["rpdo_margin_us"]["min"] == -200.0
+    with paths[1].open() as file:
+        rows = list(csv.DictReader(file))
+    for quantity in ("sync_error", "tpdo_to_rpdo", "sync_to_rpdo"):
+        for name in ("idle", "load"):
+            of_it = [r for r in rows if (r["quantity"], r["phase"]) == (quantity, name)]
+            assert sum(int(row["cycles"]) for row in of_it) == 4
+    assert imread(paths[2]).shape[:2] == (504, 1440)
+
+
+def test_folder_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"--output .*file/x: Not a directory"):
+        write_latency(measured(), tmp_path / "file" / "x")
+
+
+# The command
+
+
+def test_command_over_unixcan(start: Start, tmp_path: Path) -> None:
+    file = config_file(
+        tmp_path / "c.toml",
+        {'channel = "/tmp/canwall.sock"': f'channel = "{tmp_path / "bus"}"'},
+        config.shipped("config/unixcan.toml"),
+    )
+    drive = start(COMMAND, "drive", file)
+    assert drive.stdout is not None
+    drive.stdout.readline()
+    done = command(
+        *("latency", file, "--duration", "0.2", "--load", "1", "--output", tmp_path / "out")
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "exchange native; the drive is set up, not enabled" in done.stdout
+    assert done.stdout.splitlines()[-1].startswith(("holds", "does not hold", "not even"))
+    assert (tmp_path / "out" / "latency.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("missing.toml",), "missing.toml"),
+        (("--exchange", "other"), "bus.exchange"),
+        (("--duration", "0"), "--duration"),
+        (("--load", "-1"), "--load"),
+    ],
+)
+def test_bad_input(arguments: tuple[str, ...], said: str) -> None:
+    done = command("latency", *arguments)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert said in line
+
+
+def test_ctrl_c(start: Start) -> None:
+    running = start(COMMAND, "latency", "--duration", "3600", "--load", "1", "--exchange", "native")
+    # Its ring is there: it has begun.
+    wait_for(lambda: "canwall-record" in Path(f"/proc/{running.pid}/maps").read_text())
+    running.send_signal(2)
+    _, errors = running.communicate(timeout=60.0)
+    assert running.returncode == 130
+    assert errors.splitlines() == ["canwall: interrupted; the drive is as it was"]
