@@ -106,6 +106,8 @@ def run(
     for result in results:
         _console.print(_strike_table(result.summary["strikes"]))
         _console.print(f"record: {result.folder.path}", soft_wrap=True, highlight=False)
+        for advice in result.summary["timing"]["advice"] if result is results[0] else ():
+            _console.print(advice, soft_wrap=True, highlight=False, markup=False)
         for remark in result.remarks:
             _error(remark)
         for note in result.notes:

@@ -22,6 +22,7 @@ from canwall.config import Settings
 from canwall.cycle import (
     Axis,
     Exchange,
+    Grant,
     buckets_ns,
     percentile_ns,
     real_time_machine,
@@ -108,7 +109,7 @@ class Latency:
     bitrate: int
     cycle_s: float
     exchange: str
-    granted: dict[str, str]
+    granted: dict[str, Grant]
     load: str
     phases: tuple[Phase, ...]
     budget: Budget
@@ -284,7 +285,7 @@ def _budget(axis: Axis, settings: Settings) -> Budget:
 
 
 def verdict(
-    phases: Sequence[Phase], budget: Budget, settings: Settings, granted: dict[str, str]
+    phases: Sequence[Phase], budget: Budget, settings: Settings, granted: dict[str, Grant]
 ) -> Verdict:
     """The shortest cycle that is held: one RPDO of a thousand may come after the next SYNC.
 
@@ -347,5 +348,9 @@ def _largest_part(phase: Phase) -> str:
     return max(parts, key=lambda name: parts[name])
 
 
-def _priority(granted: dict[str, str]) -> str:
-    return "" if granted["scheduling"].startswith("SCHED_FIFO") else ", without real-time priority"
+def _priority(granted: dict[str, Grant]) -> str:
+    return (
+        ""
+        if granted["scheduling"].found.startswith("SCHED_FIFO")
+        else ", without real-time priority"
+    )

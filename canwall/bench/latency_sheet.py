@@ -63,8 +63,9 @@ def lines(latency: Latency) -> Iterator[str]:
         f"{latency.exchange}; the drive is set up, not enabled, and gets zero torque"
     )
     yield f"load: {latency.load}"
-    for what, granted in latency.granted.items():
-        yield f"{what.replace('_', '-')}: {granted}"
+    for what, grant in latency.granted.items():
+        advice = f"; {grant.advice}" if grant.advice else ""
+        yield f"{what.replace('_', '-')}: {grant.found}{advice}"
     for quantity in QUANTITIES:
         yield ""
         yield f"{quantity.title} [µs]"
@@ -153,7 +154,7 @@ def _numbers(latency: Latency) -> dict[str, Any]:
         "bitrate": latency.bitrate,
         "cycle_s": latency.cycle_s,
         "exchange": latency.exchange,
-        "machine": latency.granted,
+        "machine": {name: grant.found for name, grant in latency.granted.items()},
         "load": latency.load,
         "phases": {
             phase.name: {

@@ -7,7 +7,7 @@ from canwall.cycle.laws import run_laws
 from canwall.cycle.loop import Outcome, run_loop
 from canwall.cycle.machine import real_time_machine
 from canwall.cycle.native import NativeExchange
-from canwall.cycle.realtime import real_time_priority
+from canwall.cycle.realtime import Grant, real_time_priority
 from canwall.cycle.step import (
     CYCLE,
     MAX_LAWS,
@@ -30,6 +30,7 @@ __all__ = [
     "Change",
     "Exchange",
     "ExternalSync",
+    "Grant",
     "NativeExchange",
     "Outcome",
     "ProducedSync",

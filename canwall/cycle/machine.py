@@ -12,18 +12,22 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from canwall.cycle.realtime import real_time_priority
+from canwall.cycle.realtime import Grant, limits_line, real_time_priority
 
 #: sys/mman.h. Only pages that are used are locked: libraries map far more than they touch.
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 #: Whoever holds this file open limits the time that a processor may take to wake up.
 _WAKE_UP = Path("/dev/cpu_dma_latency")
+_UDEV_RULE = (
+    "in /etc/udev/rules.d/99-cpu-dma-latency.rules, for a group that you are in: "
+    'KERNEL=="cpu_dma_latency", GROUP="realtime", MODE="0660"'
+)
 #: How soon another Python thread gives the interpreter back between two looks of the loop [s].
 _SWITCH_INTERVAL_S = 1e-4
 
 
 @contextmanager
-def real_time_machine(processor: int | None = None) -> Iterator[dict[str, str]]:
+def real_time_machine(processor: int | None = None) -> Iterator[dict[str, Grant]]:
     """Everything that the process may have; tells what was granted, and how to get the rest.
 
     `processor`: the one that the loop's thread is to stay on; it may be one that is kept free of
@@ -49,47 +53,48 @@ def real_time_machine(processor: int | None = None) -> Iterator[dict[str, str]]:
 
 
 @contextmanager
-def _memory_locked() -> Iterator[str]:
+def _memory_locked() -> Iterator[Grant]:
     library = ctypes.CDLL(None, use_errno=True)
     if library.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) != 0:
-        yield (
-            f"not locked ({os.strerror(ctypes.get_errno())}): allow it in "
-            "/etc/security/limits.conf: '@realtime - memlock unlimited' for a group that you are in"
-        )
+        why = os.strerror(ctypes.get_errno())
+        yield Grant(f"not locked ({why})", limits_line("memlock", "unlimited"))
         return
     try:
-        yield "locked"
+        yield Grant("locked")
     finally:
         library.munlockall()
 
 
 @contextmanager
-def _awake() -> Iterator[str]:
+def _awake() -> Iterator[Grant]:
     try:
         file = _WAKE_UP.open("wb", buffering=0)
     except OSError as error:
-        yield (
-            f"processors may sleep deeply ({_WAKE_UP}: {error.strerror}): let a group that you are "
-            "in write to it"
+        yield Grant(
+            f"processors may sleep deeply ({_WAKE_UP}: {error.strerror})",
+            "" if isinstance(error, FileNotFoundError) else _UDEV_RULE,
         )
         return
     with file:
         file.write(struct.pack("=i", 0))
-        yield "processors stay awake"
+        yield Grant("processors stay awake")
 
 
 @contextmanager
-def _on_processor(processor: int | None) -> Iterator[str]:
+def _on_processor(processor: int | None) -> Iterator[Grant]:
     before = os.sched_getaffinity(0)
     if processor is None:
-        yield f"any of {len(before)}"
+        yield Grant(f"any of {len(before)}")
         return
     try:
         os.sched_setaffinity(0, {processor})
     except OSError as error:
-        yield f"any of {len(before)}: bus.processor = {processor}: {error.strerror}"
+        yield Grant(
+            f"any of {len(before)}: bus.processor = {processor}: {error.strerror}",
+            f"bus.processor: one of {', '.join(map(str, sorted(before)))}",
+        )
         return
     try:
-        yield f"number {processor}"
+        yield Grant(f"number {processor}")
     finally:
         os.sched_setaffinity(0, before)

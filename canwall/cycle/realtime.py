@@ -1,31 +1,67 @@
 """Real-time scheduling of the thread that runs the loop, where the process may have it."""
 
+import contextlib
+import getpass
 import os
+import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import NamedTuple
 
 #: Above what has no such priority, below the kernel's own interrupt threads (50).
 _PRIORITY = 45
 
 
-@contextmanager
-def real_time_priority() -> Iterator[str]:
-    """Run the calling thread under SCHED_FIFO; tells what was granted, in words.
+class Grant(NamedTuple):
+    """What the machine does for the loop, in words, and what would make it do more, or ""."""
 
-    Threads and processes that it starts meanwhile do not inherit it. Without the permission the
-    loop runs as any program does, and its SYNCs come when the scheduler lets it.
-    """
-    before = os.sched_getscheduler(0)
-    parameters = os.sched_getparam(0)
+    found: str
+    advice: str = ""
+
+
+def limits_line(item: str, value: object) -> str:
+    """What allows it to this user from the next login on: a line for limits.conf."""
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_PRIORITY))
-    except PermissionError:
-        yield (
-            f"no real-time priority: allow it in /etc/security/limits.conf: "
-            f"'@realtime - rtprio {_PRIORITY}' for a group that you are in"
-        )
+        user = getpass.getuser()
+    except (KeyError, OSError):  # a user without a name
+        user = f":{os.getuid()}"
+    return f"in /etc/security/limits.conf, then log in anew: {user} - {item} {value}"
+
+
+@contextmanager
+def real_time_priority() -> Iterator[Grant]:
+    """Run the calling thread under SCHED_FIFO; tells what was granted.
+
+    Threads and processes that it starts meanwhile do not inherit it. Where less than the full
+    priority is allowed (RLIMIT_RTPRIO), that is taken. Without the permission the loop runs as any
+    program does, and its SYNCs come when the scheduler lets it.
+    """
+    before, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    granted = _raise_priority()
+    if not granted:
+        yield Grant("no real-time priority", limits_line("rtprio", _PRIORITY))
         return
     try:
-        yield f"SCHED_FIFO, priority {_PRIORITY}"
+        low = granted < _PRIORITY
+        advice = limits_line("rtprio", _PRIORITY) if low else ""
+        yield Grant(f"SCHED_FIFO, priority {granted}", advice)
     finally:
-        os.sched_setscheduler(0, before, parameters)
+        try:
+            os.sched_setscheduler(0, before, parameters)
+        except PermissionError:
+            # Who is not privileged cannot take back that children start without priority.
+            os.sched_setscheduler(0, before | os.SCHED_RESET_ON_FORK, parameters)
+
+
+def _raise_priority() -> int:
+    """Take the highest priority that is allowed, and tell it; 0: none is."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_RTPRIO)
+    if soft != hard:
+        resource.setrlimit(resource.RLIMIT_RTPRIO, (hard, hard))
+    for priority in (_PRIORITY, hard):
+        if 0 < priority <= _PRIORITY:
+            policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+            with contextlib.suppress(PermissionError):
+                os.sched_setscheduler(0, policy, os.sched_param(priority))
+                return priority
+    return 0

@@ -12,6 +12,7 @@ from canwall.cycle import (
     Change,
     Exchange,
     ExternalSync,
+    Grant,
     NativeExchange,
     Outcome,
     PythonCanExchange,
@@ -128,8 +129,8 @@ def restored() -> Iterator[tuple[list[Axis], dict[str, list[str]]]]:
                 left[axis.name] = axis.node.restore()
 
 
-def scheduled(settings: Settings) -> AbstractContextManager[dict[str, str]]:
+def scheduled(settings: Settings) -> AbstractContextManager[dict[str, Grant]]:
     """The machine's set-up for a run that keeps to the clock; tells what was granted."""
     if settings.real_time:
         return real_time_machine(settings.bus.processor)
-    return nullcontext({"scheduling": "simulated time"})
+    return nullcontext({"scheduling": Grant("simulated time")})

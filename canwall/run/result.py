@@ -7,7 +7,7 @@ from typing import Any
 import pyarrow as pa
 
 from canwall.config import ConfigError, Settings
-from canwall.cycle import Axis, Exchange, Outcome, Watch, timing_summary
+from canwall.cycle import Axis, Exchange, Grant, Outcome, Watch, timing_summary
 from canwall.drive import DriveSetup
 from canwall.errors import RunFailedError
 from canwall.record import RecordError, RunFolder, read_signals
@@ -30,7 +30,7 @@ def result_of(
     axis: Axis,
     exchange: Exchange,
     watch: Watch,
-    scheduling: dict[str, str],
+    machine: dict[str, Grant],
     folder: RunFolder,
     outcome: Outcome,
     notes: list[str],
@@ -53,7 +53,8 @@ def result_of(
         "drive": _described(axis.setup),
         "timing": {
             "exchange": exchange.name,
-            **scheduling,
+            **{name: grant.found for name, grant in machine.items()},
+            "advice": [f"{g.found}; {g.advice}" for g in machine.values() if g.advice],
             "sync_interval": timing_summary(exchange.sync_interval),
             "tpdo_to_rpdo": timing_summary(axis.latency),
             **(_by_the_clock(axis, exchange) if settings.real_time else {}),

@@ -87,7 +87,7 @@ def run_together(
                     closing(exchange),
                     open_to_changes(axes, folders),
                     stop_on_signals() as stop,
-                    scheduled(first) as scheduling,
+                    scheduled(first) as machine,
                 ):
                     outcome = render(
                         exchange,
@@ -102,7 +102,7 @@ def run_together(
         said = [*noted, *watch.notes] if axis is axes[0] else noted
         remarks = [*remarks_on(axis.setup, axis.settings), *not_restored.get(axis.name, [])]
         remarks += outcome.notes if axis is axes[0] else []
-        results.append(result_of(axis, exchange, watch, scheduling, folder, outcome, said, remarks))
+        results.append(result_of(axis, exchange, watch, machine, folder, outcome, said, remarks))
     report("drawing")
     for folder in folders:
         plot_run(folder)

@@ -84,7 +84,7 @@ def sync_jitter() -> dict[str, Any]:
     as in a run: with real-time priority where it is granted.
     """
     with real_time_priority() as granted:
-        result: dict[str, Any] = {"aim": "ratio <= 0.2", "scheduling": granted}
+        result: dict[str, Any] = {"aim": "ratio <= 0.2", "scheduling": granted.found}
     for name, processes in (("idle", 0), ("loaded", 2)):
         with _load(processes):
             turns = [(_ours(), _canopens()) for _ in range(_TURNS)]

@@ -328,7 +328,7 @@ def under_python() -> dict[str, Any]:
     ratios = [loaded["p99.9_us"] / idle["p99.9_us"] for idle, loaded in turns]
     names = list(turns[0][0])
     return {
-        "scheduling": granted,
+        "scheduling": granted.found,
         "idle": {n: round(statistics.median(idle[n] for idle, _ in turns), 2) for n in names},
         "loaded": {n: round(statistics.median(busy[n] for _, busy in turns), 2) for n in names},
         "ratio": round(statistics.median(ratios), 2),

@@ -18,12 +18,12 @@ from canwall.bench.budget import Budget, CyclicFrame, bus_budget
 from canwall.bench.latency import Histogram, Latency, Phase, measure_latency, verdict
 from canwall.bench.latency_sheet import QUANTITIES, lines, percentiles_us, write_latency
 from canwall.config import Settings
-from canwall.cycle import HISTOGRAM, observe_ns
+from canwall.cycle import HISTOGRAM, Grant, observe_ns
 from canwall.errors import InputError, RunFailedError
 from canwall.run import StopRequest
 
 REAL_TIME = {"bus.interface": "socketcan", "bus.channel": "can0"}
-GRANTED = {"scheduling": "SCHED_FIFO, priority 45"}
+GRANTED = {"scheduling": Grant("SCHED_FIFO, priority 45")}
 
 
 @pytest.fixture
@@ -152,7 +152,9 @@ def test_bus_that_bounds_the_cycle() -> None:
 def test_machine_that_bounds_the_cycle() -> None:
     settings = bench_settings()
     parts = [phase("idle", 100.0), phase("load", 700.0)]
-    found = verdict(parts, budget(settings), settings, {"scheduling": "no real-time priority: …"})
+    found = verdict(
+        parts, budget(settings), settings, {"scheduling": Grant("no real-time priority")}
+    )
     assert found.by_machine_s == pytest.approx(700e-6 + 95e-6, rel=1 / 32)
     assert found.holds_s >= found.by_machine_s
     assert "(under load), most of it until the TPDO comes, without real-time priority" in found.text

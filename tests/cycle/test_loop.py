@@ -2,6 +2,7 @@
 
 import gc
 import struct
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -562,3 +563,63 @@ def test_lost_tpdos_are_those_that_the_simulation_loses(make_rig: RigFactory) ->
     rows = loop.rows()
     assert rows["j"][~rows["received"].astype(bool)].tolist() == [50]
     assert loop.record["missed_tpdo"][0] == 1
+
+
+# RPDOs that come too late, in real time: a drive that answers after the next SYNC is due
+
+
+def answering_late(loop: Loop, late: Callable[[int], bool]) -> None:
+    """In the cycles that are picked the TPDO comes when the next SYNC is over-due."""
+    process = loop.rig.tampering.process
+
+    def slow(can_id: int, data: bytes) -> list[tuple[int, bytes]]:
+        if can_id == SYNC and late(int(loop.record["j"][0])):
+            time.sleep(0.0013)
+        return process(can_id, data)
+
+    loop.rig.tampering.process = slow  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize("ahead", [1, 1000])
+def test_late_rpdos_end_the_run(make_rig: RigFactory, ahead: int) -> None:
+    loop = Loop(make_rig(pressing({"limits.late_cycles": 30})), real_time=True)
+    loop.exchange.ahead = ahead
+    answering_late(loop, lambda j: j >= PRESSING)
+    outcome = loop.run(None)
+    (trip,) = outcome.trips
+    assert trip.endswith(
+        ": RPDOs after the next SYNC for 30 cycles, limits.late_cycles = 30: the machine is too "
+        "slow for bus.cycle_s"
+    )
+    assert outcome.trip_cycle is not None
+    # Of the cycles before some may have been late as well: the machine has other things to do.
+    assert outcome.trip_cycle < PRESSING + 30
+    assert loop.axis.late_rpdo >= 30
+    rows = loop.rows()
+    assert rows["torque_cmd_per_mille"][rows["j"] == outcome.trip_cycle] != 0
+    assert_ended_in_order(loop, outcome, rows)
+
+
+def test_late_rpdos_that_are_only_counted(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing({"limits.late_cycles": 0})), real_time=True)
+    answering_late(loop, lambda j: PRESSING <= j < PRESSING + 60)
+    outcome = loop.run(PRESSING + 60)
+    assert outcome.trips == []
+    assert loop.axis.late_rpdo >= 60
+
+
+def test_late_rpdos_with_one_in_time_among_them(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing({"limits.late_cycles": 30})), real_time=True)
+    prompt = False
+
+    def late(j: int) -> bool:
+        nonlocal prompt
+        # After a number that is not yet too large: prompt, until one was in time.
+        in_a_row = loop.axis.late_in_a_row
+        prompt = in_a_row >= 15 or (prompt and in_a_row > 0)
+        return j >= PRESSING and not prompt
+
+    answering_late(loop, late)
+    outcome = loop.run(None, lambda j: loop.axis.late_rpdo >= 60)
+    assert outcome.trips == []
+    assert loop.axis.late_rpdo >= 60

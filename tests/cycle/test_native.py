@@ -3,6 +3,7 @@
 import errno
 import os
 import socket
+import time
 from collections.abc import Callable
 
 import can
@@ -86,6 +87,23 @@ def test_real_time_keeps_to_the_grid_of_its_first_sync(make_rig: RigFactory) -> 
         deadlines.append(loop.exchange.deadline_ns)
     assert set(np.diff(deadlines) % 1_000_000) == {0}
     assert min(np.diff(deadlines)) > 0
+
+
+def test_latency_begins_with_the_arrival_of_the_tpdo(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing()), real_time=True)
+    poll = loop.rig.link.idle
+    assert poll is not None
+
+    def and_something_else() -> None:
+        poll()  # the TPDO is there from now on, whoever looks for it when
+        time.sleep(0.002)
+
+    loop.rig.link.idle = and_something_else
+    for _ in range(3):
+        loop.exchange.cycle()
+    rows = loop.rows()
+    assert rows["received"].all()
+    assert (rows["latency_s"] >= 0.002).all()
 
 
 # A bus that fails
