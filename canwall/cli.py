@@ -325,6 +325,8 @@ def sweep(
     ] = False,
 ) -> int:
     """How stiff the wall can be: strikes over any axes, or the K-limit at each of their points."""
+    if workers is not None and dask is not None:
+        raise InputError("--workers and --dask: keep one; a cluster has workers of its own")
     given: dict[str, object] = {}
     for name, equals, values in (text.partition("=") for text in axis or []):
         if not equals or name in given:

@@ -15,6 +15,9 @@ from canwall.sweep.closed_loop import known_scales, loop_delay
 from canwall.sweep.strike import OPERATORS, model_of, struck
 from canwall.walls import DEADBEAT, MAX_DELAY
 
+#: More values than this on one axis are a slip of the pen.
+_MOST_VALUES = 1_000_000
+
 Value = str | int | float | bool
 Point = Mapping[str, Value]
 
@@ -101,6 +104,8 @@ def _written(name: str, text: str) -> list[Value]:
         kind = parts[3] if len(parts) == 4 else ("log" if name in STIFFNESS else "lin")
         if not isinstance(count, int) or count < 1 or kind not in ("log", "lin"):
             raise InputError(f"sweep axis {name}: {text!r} is no range; write LO:HI:N")
+        if count > _MOST_VALUES:
+            raise InputError(f"sweep axis {name}: {count} values; {_MOST_VALUES} at most")
         if kind == "log" and not (low > 0 and high > 0):  # type: ignore[operator]
             raise InputError(f"sweep axis {name}: {text!r}: a geometric range has to be above 0")
         spaced = np.geomspace if kind == "log" else np.linspace
@@ -135,7 +140,8 @@ def _check(name: str, value: Value) -> None:
     low = {"model_error": -1.0}.get(name, 0.0)
     may_be_low = name in ("damping", "damping_normalised", "delay", "phase")
     if not (value > low or (may_be_low and value == low)):  # type: ignore[operator]
-        raise InputError(f"sweep axis {name}: has to be greater than {low:g}, not {value!r}")
+        least = "at least" if may_be_low else "greater than"
+        raise InputError(f"sweep axis {name}: has to be {least} {low:g}, not {value!r}")
     if name == "delay" and value > MAX_DELAY:  # type: ignore[operator]
         raise InputError(f"sweep axis delay: has to be {MAX_DELAY} at most, not {value!r}")
     if name == "counts" and value != int(value):

@@ -17,9 +17,9 @@ class Journal:
 
     def __init__(self, output: Path, plan: str, resume: bool) -> None:
         """plan: what has to be the same for pieces to fit together. Raises InputError."""
-        self.path = output.with_name(output.name + ".partial")
         if output.exists():
             raise InputError(f"{output}: exists already; choose another --output")
+        self.path = output.with_name(output.name + ".partial")
         if self.path.exists() and not resume:
             raise InputError(
                 f"{self.path}: holds an unfinished sweep; --resume goes on with it, or remove it"
@@ -34,8 +34,12 @@ class Journal:
             known = self._base.execute("SELECT text FROM plan").fetchone()
             if known is None:
                 self._base.execute("INSERT INTO plan VALUES (?)", (plan,))
-        except sqlite3.Error as error:
+        except sqlite3.OperationalError as error:
             raise InputError(f"{self.path}: cannot be written: {error}") from None
+        except sqlite3.DatabaseError:
+            raise InputError(
+                f"{self.path}: holds no unfinished sweep; remove it, or choose another --output"
+            ) from None
         if known is not None and known[0] != plan:
             self._base.close()
             raise InputError(

@@ -29,6 +29,8 @@ from canwall.sweep.strike import Strike
 
 #: Points of a map that are one piece of work: its strike is prepared once.
 _PIECE = 120
+#: The largest result: 1.5 GB.
+_MOST_POINTS = 10_000_000
 
 
 @dataclass(frozen=True)
@@ -146,6 +148,8 @@ def make_plan(base: Settings, given: Mapping[str, object], through: str = "sim")
     assert damping is not None
     law = axes.pop("law")
     plan = Plan(base, (law, *axes.values()), stiffness, damping, speed, phase, through)
+    if plan.points_in_all > _MOST_POINTS:
+        raise InputError(f"sweep axes: {plan.points_in_all} points; {_MOST_POINTS} at most")
     _try_out(plan)
     return plan
 

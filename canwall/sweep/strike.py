@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from canwall.config import Hand, Mechanics, Settings
+from canwall.config import ConfigError, Hand, Mechanics, Settings
 from canwall.cycle import run_laws
 from canwall.record import Phase, Ring
 from canwall.referent import Referent
@@ -60,6 +60,8 @@ _FIRST_STRIKE_S = 0.05
 _AFTERWARDS_S = 0.25
 #: Cycles of rest between enabling and the strike: at 100 Hz the above is no time for it.
 _AT_REST_CYCLES = 3
+#: The longest strike: 100 MB of signals.
+_MOST_CYCLES = 2_000_000
 
 
 def model_of(settings: Settings, knows: str, error: float) -> Mechanics:
@@ -93,7 +95,7 @@ def struck(
 
     speed_rad_s is the mean speed of the hand's approach from start_rad off the wall; phase,
     0 … 1, shifts the start by that share of the way of one period, and with it the instant of
-    contact against the SYNC.
+    contact against the SYNC. Raises ConfigError for a strike that lasts too many cycles.
     """
     simulation, period = settings.simulation, settings.bus.cycle_s
     assert simulation is not None
@@ -120,6 +122,11 @@ def struck(
         }
     )
     duration = first_s + 2.0 * travel_s + press_s + _AFTERWARDS_S
+    if duration > _MOST_CYCLES * period:
+        raise ConfigError(
+            f"sweep axes speed, start, press, rate: a strike of {duration:.4g} s has "
+            f"{duration / period:.3g} cycles; {_MOST_CYCLES} at most"
+        )
     return settings.model_copy(
         update={
             "simulation": simulation.model_copy(update={"hand": hand}),

@@ -41,7 +41,7 @@ def sweep(
         whole = gathered(plan, {p: journal.get(p, plan.dtype) for p in range(plan.pieces)})
         _write(whole, output)
         journal.remove()
-    except InputError:
+    except BaseException:
         # Nothing was computed: nothing is left behind.
         if not journal.done():
             journal.remove()
@@ -64,6 +64,8 @@ def _write(dataset: xr.Dataset, output: Path) -> None:
 
 def read_sweep(path: Path) -> xr.Dataset:
     """The result of a sweep. Raises InputError where the file holds none."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give the result of a sweep")
     try:
         with xr.open_dataset(path, engine=ENGINE) as stored:
             dataset = stored.load()

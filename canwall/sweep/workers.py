@@ -1,5 +1,6 @@
 """Who computes the pieces of a sweep: threads, processes, or a Dask cluster."""
 
+import asyncio
 import logging
 import multiprocessing
 import os
@@ -14,8 +15,8 @@ from canwall.errors import InputError, RunFailedError
 from canwall.sweep.plan import Plan, compute
 
 Found = tuple[int, NDArray[np.void]]
-#: How long to wait for a Dask scheduler [s].
-_PATIENCE_S = 10.0
+#: How long to wait for a Dask scheduler to be there, and to answer [s].
+_THERE_S, _PATIENCE_S = 3.0, 10.0
 
 
 def computed(
@@ -58,11 +59,15 @@ def _on_a_cluster(plan: Plan, pieces: Sequence[int], address: str) -> Iterator[F
     # What it has to say comes as an exception too.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     try:
-        # A client that cannot read its address hangs at the end of the program.
+        # A client that cannot read its address, or meets somebody else there, hangs.
         distributed.comm.get_address_host_port(address, strict=True)
+        asyncio.run(asyncio.wait_for(_greet(address), _THERE_S))
         client = distributed.Client(address, timeout=_PATIENCE_S, set_as_default=False)
-    except (OSError, ValueError, TimeoutError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    except (OSError, ValueError, TimeoutError, MemoryError) as error:
+        # Who speaks another protocol is taken to announce more than there is memory.
+        if isinstance(error, MemoryError):
+            error = ValueError("what is there is none")
+        reason = str(error).splitlines()[0] if str(error) else "no answer"
         raise InputError(f"--dask {address}: no scheduler there: {reason}") from None
     with client:
         jobs = {
@@ -76,3 +81,18 @@ def _on_a_cluster(plan: Plan, pieces: Sequence[int], address: str) -> Iterator[F
             raise RunFailedError(f"--dask {address}: {error}") from None
         finally:
             client.cancel(list(jobs))
+
+
+async def _greet(address: str) -> None:
+    """Raise OSError, ValueError where no scheduler answers."""
+    import distributed
+
+    arguments = distributed.Security().get_connection_args("client")
+    comm = await distributed.core.connect(address, timeout=_THERE_S, **arguments)
+    try:
+        await comm.write({"op": "identity", "reply": True})
+        answer = await comm.read()
+    finally:
+        comm.abort()
+    if not isinstance(answer, dict) or answer.get("type") != "Scheduler":
+        raise ValueError("what is there is none")

@@ -130,11 +130,18 @@ def test_limits_of_one_condition_and_what_cannot_be_drawn(tmp_path: Path) -> Non
         write_sweep_figures(point, tmp_path / "point")
 
 
-@pytest.mark.parametrize("content", [None, b"", b"no result"])
-def test_a_file_that_is_no_sweep(tmp_path: Path, content: bytes | None) -> None:
+@pytest.mark.parametrize(
+    ("content", "line"),
+    [
+        (None, "no such file"),
+        (b"", "no result of a sweep"),
+        (b"no result", "no result of a sweep"),
+    ],
+)
+def test_a_file_that_is_no_sweep(tmp_path: Path, content: bytes | None, line: str) -> None:
     if content is not None:
         (tmp_path / "a.nc").write_bytes(content)
     done = command("plot", "a.nc", cwd=tmp_path)
     assert done.returncode == 2
-    assert done.stderr.startswith("canwall: a.nc: no result of a sweep")
+    assert done.stderr.startswith(f"canwall: a.nc: {line}")
     assert len(done.stderr.splitlines()) == 1

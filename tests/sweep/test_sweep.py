@@ -1,6 +1,7 @@
 """Sweeps: the same numbers through frames, whoever computes them, and after an interruption."""
 
 import json
+import socket
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import pytest
 from commands import command
 from rig import settings_with
 
+from canwall import cli
 from canwall.errors import InputError
 from canwall.sweep import Plan, make_plan, read_sweep, sweep
 from canwall.sweep.journal import Journal
@@ -141,6 +143,14 @@ def test_an_interrupted_sweep_goes_on(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["parts.nc", "whole.nc"]
 
 
+def test_a_file_that_is_no_journal_is_left_alone(tmp_path: Path) -> None:
+    partial = tmp_path / "a.nc.partial"
+    partial.write_text("a letter")
+    with pytest.raises(InputError, match="holds no unfinished sweep"):
+        sweep(plan_of(stiffness=[1.0]), tmp_path / "a.nc", resume=True)
+    assert partial.read_text() == "a letter"
+
+
 def test_a_journal_cut_short_by_a_power_cut_keeps_what_is_whole(tmp_path: Path) -> None:
     output = tmp_path / "a.nc"
     plan = plan_of(stiffness="1:100:3")
@@ -172,6 +182,11 @@ def test_a_journal_cut_short_by_a_power_cut_keeps_what_is_whole(tmp_path: Path) 
         ({"law": "none"}, "wall.law: unknown law 'none'"),
         ({"wall.stiffness_nm_per_rad": "1"}, "is called stiffness here"),
         ({"delay": "3.5"}, "axis delay: has to be 3 at most"),
+        ({"damping": "-1"}, "axis damping: has to be at least 0, not -1"),
+        ({"rate": "1e8"}, "a strike of .* cycles; 2000000 at most"),
+        ({"press": "1e9"}, "a strike of .* cycles; 2000000 at most"),
+        ({"stiffness": "1:2:99999999999"}, "99999999999 values; 1000000 at most"),
+        ({"stiffness": "1:2:9999", "damping": "1:2:9999"}, "99980001 points; 10000000 at most"),
         ({"counts": "10.5"}, "has to be a whole number"),
         ({"torque_step": "1.5e-7"}, "whole µN·m"),
         ({"stiffness": "1", "stiffness_normalised": "1"}, "keep one of them"),
@@ -188,21 +203,40 @@ def test_a_wrong_axis(axes: dict[str, str], message: str) -> None:
         (["--axis", "colour=red"], "sweep axis colour: unknown key"),
         (["--axis", "speed"], "--axis speed: has to be NAME=VALUES"),
         (["--through", "air"], "--through air: has to be sim or bus"),
+        (["--workers", "2", "--dask", "nowhere"], "--workers and --dask: keep one"),
+        (["--output", "."], ".: exists already"),
         (["--output", "/none/a.nc"], "/none/a.nc.partial: cannot be written"),
         (["--dask", "tcp://127.0.0.1:9"], "--dask tcp://127.0.0.1:9: no scheduler there"),
         (["--dask", "nowhere"], "--dask nowhere: no scheduler there"),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(
-    tmp_path: Path, arguments: list[str], line: str
+    tmp_path: Path,
+    arguments: list[str],
+    line: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     output = [] if "--output" in arguments else ["--output", "a.nc"]
-    done = command(
-        "sweep", settings_file(), "--stiffness", "1,2", *output, *arguments, cwd=tmp_path
-    )
-    assert done.returncode == 2, done.stderr
-    assert done.stderr.splitlines()[0].startswith(f"canwall: {line}")
-    assert len(done.stderr.splitlines()) == 1, done.stderr
+    given = ["sweep", str(settings_file()), "--stiffness", "1,2", *output, *arguments]
+    assert cli.guarded(lambda: cli.app(given, standalone_mode=False)) == 2
+    errors = capsys.readouterr().err
+    assert errors.splitlines()[0].startswith(f"canwall: {line}")
+    assert len(errors.splitlines()) == 1, errors
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_somebody_else_at_the_address_is_no_scheduler(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        done = command(
+            *("sweep", settings_file(), "--stiffness", "1", "--output", "a.nc"),
+            *("--dask", address),
+            cwd=tmp_path,
+        )
+    assert done.returncode == 2
+    assert done.stderr == f"canwall: --dask {address}: no scheduler there: no answer\n"
     assert list(tmp_path.iterdir()) == []
 
 
