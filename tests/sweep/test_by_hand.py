@@ -179,6 +179,7 @@ def test_enter_ends_a_wall_and_q_the_session(folder: Path, people: list[Person])
     code, said, errors = person.end()
     assert (code, errors) == (0, "")
     assert "The drive is disabled." in said
+    assert "free of chatter?" not in said
     assert "1 verdicts" in said
     assert_ended(folder / "01-K5")
     assert_ended(folder / "02-K2.5")
