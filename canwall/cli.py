@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
-import numpy as np
 import typer
 from can import CanError
 from rich.console import Console
@@ -21,8 +20,6 @@ from canwall.config import ConfigError, Settings, absolute_law
 from canwall.errors import InputError, RunFailedError
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from canwall.bench import Findings
 
 app = typer.Typer(
@@ -341,7 +338,7 @@ def sweep(
     }
     given |= {name: values for name, values in named.items() if values}
     settings = _settings(config_file)
-    from canwall.sweep import make_plan
+    from canwall.sweep import make_plan, sweep_table
     from canwall.sweep import sweep as swept
 
     with _RunProgress() as shown:
@@ -350,29 +347,13 @@ def sweep(
             dataset = swept(plan, output, resume, workers, dask, partial(shown.count, "sweeping"))
         except KeyboardInterrupt:
             raise _InterruptedError(f"interrupted; --resume goes on with {output}") from None
-    if "worst" in dataset:
-        _console.print(_limit_table(dataset))
-    _console.print(f"{plan.points_in_all} points: {output}", soft_wrap=True, highlight=False)
+    _console.print(sweep_table(dataset))
+    _console.print(
+        f"{plan.points_in_all} points: {output}; canwall plot {output} draws them",
+        soft_wrap=True,
+        highlight=False,
+    )
     return 0
-
-
-def _limit_table(dataset: "xr.Dataset") -> Table:
-    """K-limits, a row for each condition."""
-    worst = dataset["worst"]
-    table = Table(title="K-limits", title_justify="left")
-    shown = [str(dim) for dim in worst.dims if worst.sizes[dim] > 1 or dim == "law"]
-    for name in (*shown, "K\n\\[N·m/rad]", "K·T²/m", "spread"):
-        table.add_column(name, justify="left" if name == "law" else "right", no_wrap=True)
-    limit = dataset["limit"]
-    spread = limit.max(("speed", "phase")) / worst
-    normalised = dataset["worst_normalised"]
-    for at in np.ndindex(*worst.shape):
-        where = dict(zip(map(str, worst.dims), at, strict=True))
-        values = [dataset[name].values[where[name]] for name in shown]
-        cells = [v if isinstance(v, str) else f"{v:g}" for v in values]
-        numbers = (worst.values[at], normalised.values[at], spread.values[at])
-        table.add_row(*map(escape, cells), *(f"{x:.3g}" for x in numbers))
-    return table
 
 
 @app.command()

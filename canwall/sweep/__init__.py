@@ -2,6 +2,7 @@
 
 from canwall.sweep.dataset import gathered
 from canwall.sweep.plan import Plan, make_plan
+from canwall.sweep.shown import sweep_table
 from canwall.sweep.strike import OPERATORS, Operator, Strike
 from canwall.sweep.sweeping import read_sweep, sweep
 
@@ -14,4 +15,5 @@ __all__ = [
     "make_plan",
     "read_sweep",
     "sweep",
+    "sweep_table",
 ]

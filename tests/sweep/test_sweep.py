@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
 from commands import command
 from rig import settings_with
 
 from canwall import cli
 from canwall.errors import InputError
-from canwall.sweep import Plan, make_plan, read_sweep, sweep
+from canwall.sweep import Plan, make_plan, read_sweep, sweep, sweep_table
 from canwall.sweep.journal import Journal
 from canwall.sweep.plan import compute
 from canwall.sweep.workers import computed
@@ -255,7 +256,7 @@ def test_the_axes_of_the_file_and_those_of_the_command_line(tmp_path: Path) -> N
     )
     done = command("sweep", file, "--output", "a.nc", "--stiffness", "2,4", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
-    assert "8 points: a.nc" in done.stdout
+    assert "8 points: a.nc; canwall plot a.nc draws them" in done.stdout
     found = read_sweep(tmp_path / "a.nc")
     assert list(found["law"].values) == ["midpoint", "standard"]
     assert list(found["stiffness"].values) == [2, 4]
@@ -284,3 +285,22 @@ def test_k_limits_are_shown_in_a_table(tmp_path: Path) -> None:
     assert "standard" in done.stdout
     worst = read_sweep(tmp_path / "a.nc")["worst"].item()
     assert f"{worst:.3g}" in done.stdout
+
+
+def test_a_map_is_shown_in_a_table() -> None:
+    dataset = xr.Dataset(
+        {
+            "chatters": (
+                ("law", "damping", "stiffness", "speed", "phase"),
+                np.array([[[0, 0, 1], [0, 1, 0]], [[1, 1, 1], [1, 0, 1]]], bool)[..., None, None],
+            ),
+            "energy_out": (
+                ("law", "damping", "stiffness", "speed", "phase"),
+                np.zeros((2, 2, 3, 1, 1)),
+            ),
+        },
+        {"law": ["a", "b"], "damping": [0.0, 1.0], "stiffness": [1.0, 2.0, 3.0]},
+    )
+    table = sweep_table(dataset)
+    columns = [list(column.cells) for column in table.columns]
+    assert columns == [["a", "b"], ["6", "6"], ["4", "1"], ["2", "none"], ["0", "0"]]
