@@ -106,13 +106,18 @@ def rpdo(data: bytes) -> tuple[int, int]:
 
 @contextmanager
 def walled(
-    start: Start, tmp_path: Path, watchdog: str = "RPDO event timer"
+    start: Start,
+    tmp_path: Path,
+    watchdog: str = "RPDO event timer",
+    exchange: str = "native",
 ) -> "Iterator[tuple[subprocess.Popen[str], Witness, Path]]":
     """A master that presses back, its drive, and a witness; with the folder of the run."""
     channel, folder = tmp_path / "bus", tmp_path / "run"
     missing, _ = WATCHDOGS[watchdog]
     eds = eds_without(tmp_path / "drive.eds", *missing)
-    changes = CHANGES | {'channel = "/tmp/canwall.sock"': f'channel = "{channel}"'}
+    changes = CHANGES | {
+        'channel = "/tmp/canwall.sock"': f'channel = "{channel}"\nexchange = "{exchange}"'
+    }
     file = config_file(tmp_path / "c.toml", changes, config.shipped("config/unixcan.toml"))
     shipped = str(config.shipped("eds/canwall-drive.eds"))
     file.write_text(file.read_text().replace(shipped, str(eds)))
@@ -131,9 +136,19 @@ def walled(
 # The master is asked to end
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_signal_that_asks_for_the_end(start: Start, tmp_path: Path, number: int) -> None:
-    with walled(start, tmp_path) as (master, witness, folder):
+@pytest.mark.parametrize(
+    ("number", "exchange"),
+    [
+        (signal.SIGINT, "native"),
+        (signal.SIGTERM, "native"),
+        (signal.SIGHUP, "native"),
+        (signal.SIGINT, "python-can"),
+    ],
+)
+def test_signal_that_asks_for_the_end(
+    start: Start, tmp_path: Path, number: int, exchange: str
+) -> None:
+    with walled(start, tmp_path, exchange=exchange) as (master, witness, folder):
         master.send_signal(number)
         _, errors = master.communicate(timeout=PATIENCE_S)
         assert (master.returncode, errors) == (130, "")
@@ -189,10 +204,13 @@ def test_impatient_ctrl_c_while_the_drive_is_taken_down(make_rig: RigFactory) ->
 # The master is dead
 
 
-@pytest.mark.parametrize("watchdog", WATCHDOGS)
-def test_master_that_is_killed(start: Start, tmp_path: Path, watchdog: str) -> None:
+@pytest.mark.parametrize(
+    ("watchdog", "exchange"),
+    [*((watchdog, "native") for watchdog in WATCHDOGS), ("consumer heartbeat", "python-can")],
+)
+def test_master_that_is_killed(start: Start, tmp_path: Path, watchdog: str, exchange: str) -> None:
     _, code = WATCHDOGS[watchdog]
-    with walled(start, tmp_path, watchdog) as (master, witness, folder):
+    with walled(start, tmp_path, watchdog, exchange) as (master, witness, folder):
         master.kill()
         assert master.wait(PATIENCE_S) == -signal.SIGKILL
         wait_for(lambda: witness.emergencies() == [code])
@@ -269,14 +287,20 @@ def test_writer_that_is_killed_takes_nothing_with_it(start: Start, tmp_path: Pat
     "body",
     ["return math.nan", "return wall.options[int(1e6 * wall.y_sample)]", 'raise ValueError("no")'],
 )
-def test_law_that_fails_in_the_contact(tmp_path: Path, body: str) -> None:
+@pytest.mark.parametrize("exchange", ["python-can", "native"])
+def test_law_that_fails_in_the_contact(tmp_path: Path, body: str, exchange: str) -> None:
     file = tmp_path / "failing.py"
     file.write_text(
         "import math\n\ndef failing(wall):\n    if wall.y_sample < -0.002:\n        "
         f"{body}\n    return -wall.stiffness * wall.y_sample\n"
     )
     folder = tmp_path / "run"
-    done = command("run", "--law", f"{file}:failing", "--duration", 1, "--output", folder)
+    configuration = config_file(
+        tmp_path / "c.toml", {'exchange = "auto" ': f'exchange = "{exchange}" '}
+    )
+    done = command(
+        "run", configuration, "--law", f"{file}:failing", "--duration", 1, "--output", folder
+    )
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
     assert line.endswith(f"law {file}:failing failed, or gave a force that is not a number")

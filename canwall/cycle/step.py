@@ -440,9 +440,12 @@ def _is_stuck(cycle: Record) -> bool:
 
     Two witnesses have to agree: the model, which knows the torques, but may have the wrong mass;
     and the last two changes of the position, carried on: a handle that was stopped slowed down.
+    Three positions that are rounded to counts leave 3 counts open of the change to which they
+    carry on, 2·(y[j] − y[j−1]) − (y[j−1] − y[j−2]); the least of it counts.
     """
     last, before = abs(cycle.change), abs(cycle.change_before)
-    went = (last - max(before - last, 0)) * abs(cycle.rad_per_count) * cycle.stuck_cycles
+    least = min(last - 1, 2 * last - before - 3)
+    went = least * abs(cycle.rad_per_count) * cycle.stuck_cycles
     return min(went, abs(cycle.motion_missed)) > cycle.stuck_limit
 
 

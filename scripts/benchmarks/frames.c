@@ -2,7 +2,7 @@
 
    frames DESCRIPTOR master CYCLES [awake]   SYNC, TPDO in, its data into an RPDO, RPDO out
    frames DESCRIPTOR drive CYCLES [awake]    waits for SYNC, TPDO out, RPDO in; to standard output
-     as 64-bit numbers: nanoseconds from TPDO to RPDO, each, and from the first SYNC to the last RPDO
+     as 64-bit numbers: nanoseconds from TPDO to RPDO and from each SYNC to the next
    It waits in recv, or awake: it looks for a frame again and again. */
 #include <stdint.h>
 #include <stdio.h>
@@ -42,15 +42,14 @@ static void master(long cycles)
 static void drive(long cycles)
 {
     struct frame in, tpdo = {.id = 0x185, .length = 8, .data = {0, 0x10, 0, 0, 0x37, 0x02, 0, 0}};
-    int64_t *took = calloc(cycles + 1, sizeof *took), first = 0;
-    for (long j = 0; j < cycles; j++) {
+    int64_t *took = calloc(2 * cycles, sizeof *took), before = 0;
+    for (long j = 0; j < cycles; j++, took += 2) {
         do take(&in); while (in.id != 0x080);
         int64_t begin = now();
-        first = j ? first : begin;
         put(&tpdo), take(&in);
-        took[j] = now() - begin, took[cycles] = begin + took[j] - first;
+        took[0] = now() - begin, took[1] = begin - before, before = begin;
     }
-    fwrite(took, sizeof *took, cycles + 1, stdout);
+    fwrite(took - 2 * cycles, sizeof *took, 2 * cycles, stdout);
 }
 
 int main(int count, char **arguments)

@@ -38,13 +38,14 @@ class Wall:
         overrides: dict[str, Any] | None = None,
         tpdo: PdoLayout = TPDO,
         rpdo: PdoLayout = RPDO,
+        units: DriveUnits = UNITS,
     ) -> None:
         # The estimator is to follow what the tests make the handle do.
         self.settings: Settings = settings_with(
             {"wall.law": "standard", "limits.torque_nm": 30.0} | (overrides or {})
         )
         self.laws = run_laws(self.settings)
-        self.cycle = make_cycle(self.settings, DriveSetup(UNITS, 0x80, tpdo, rpdo), self.laws)
+        self.cycle = make_cycle(self.settings, DriveSetup(units, 0x80, tpdo, rpdo), self.laws)
         self.cycle["phase"] = Phase.RENDERING
         self.row = np.zeros(1, ROW)
 
@@ -333,6 +334,55 @@ def test_position_that_stops_dead_where_that_is_not_watched() -> None:
     for _ in range(50):
         wall.at(last)
     assert wall.trip() == Trip.NONE
+
+
+def test_position_that_stops_dead_within_what_is_allowed() -> None:
+    # 20 counts, 20 mrad, in a cycle.
+    for stuck_rad, trip in ((0.05, Trip.STUCK), (0.2, Trip.NONE)):
+        wall = moving({"limits.stuck_rad": stuck_rad}, 2500, -20)
+        last = int(wall.cycle["counts"][0])
+        for _ in range(10):
+            wall.at(last)
+        assert wall.trip() == trip
+
+
+@settings(deadline=None, max_examples=150)
+@given(
+    per_turn=st.sampled_from([500, 2000, 8192, 131072, 1 << 20]),
+    period=st.sampled_from([0.00025, 0.001, 0.004]),
+    speed=st.floats(0.05, 12.0),
+    stop=st.floats(2.0, 10.0),
+    phase=st.floats(0.0, 1.0),
+    begin=st.floats(0.0, 1.0),
+)
+def test_handle_that_something_stops_within_two_cycles_is_not_stuck(
+    per_turn: int, period: float, speed: float, stop: float, phase: float, begin: float
+) -> None:
+    """By what no model knows of, along half a wave of a cosine, with encoders coarse and fine."""
+    far = {"bus.cycle_s": period, "wall.position_rad": -2.9}
+    wall = Wall(far, units=DriveUnits(float(per_turn), 0.637))
+    since = np.clip(np.arange(100) - 40.0 + phase, 0.0, None)
+    u = np.minimum(since, stop)
+    slowed = u / 2.0 + stop / (2.0 * np.pi) * np.sin(np.pi * u / stop)
+    way = speed * period * (np.arange(100) - since + slowed)
+    counts = np.floor((2.9 - way) * per_turn / (2.0 * np.pi) + begin).astype(int)
+    start_at(wall.cycle, int(counts[0]))
+    for value in counts:
+        wall.at(int(value))
+        assert wall.trip() != Trip.STUCK
+
+
+@pytest.mark.parametrize(("per_turn", "speed"), [(2000, 6), (131072, 100)])
+def test_encoder_that_sticks_is_found_coarse_or_fine(per_turn: int, speed: int) -> None:
+    wall = Wall({"wall.position_rad": -2.9}, units=DriveUnits(float(per_turn), 0.637))
+    counts = 60 * speed
+    start_at(wall.cycle, counts)
+    for _ in range(40):
+        counts -= speed
+        wall.at(counts)
+    for _ in range(5):
+        wall.at(counts)
+    assert wall.trip() == Trip.STUCK
 
 
 @pytest.mark.parametrize("tremor", [0, 1])
