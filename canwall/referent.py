@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall import simdrive
-from canwall.compiled import Record, compiled
+from canwall.compiled import Record, compiled, copied
 from canwall.config import Settings, Simulation
 from canwall.physics import Force, Grasp, Hand, advance, advance_grasp, make_plant
 
@@ -51,11 +51,11 @@ class Referent:
         y = np.empty(len(stiffness))
         y[0] = self._side * self._hand.rest_rad - origin[0]
         wall = (stiffness, damping, origin)
-        joined = self._joined.copy()
+        joined = copied(self._joined)
         if self._hand.grip:
             _follow(joined, *wall, pull, self._slope, self._period, y)
         else:
-            handle = self._handle.copy()
+            handle = copied(self._handle)
             _follow_apart(handle, joined, self._body, *wall, pull, self._slope, self._period, y)
         return y
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from canwall.compiled import Record, compiled
+from canwall.compiled import Record, compiled, copied
 from canwall.config import ConfigError, Settings
 from canwall.cycle import Trip, fade_in, make_cycle, run_laws, start_at, step
 from canwall.drive import DriveSetup, Field, PdoLayout, State
@@ -129,12 +129,12 @@ class ClosedLoop:
         their number. signals has shape (3, cycles): y, force, torque of `Signals`. wall: stiffness
         and damping other than the configuration's.
         """
-        cycle = self._cycle.copy()
+        cycle = copied(self._cycle)
         if wall is not None:
             _make_wall(cycle, *wall)
         done = _close(
             cycle,
-            self._servo.copy(),
+            copied(self._servo),
             self._push,
             self._slope,
             self._nm_per_mille,

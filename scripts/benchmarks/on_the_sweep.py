@@ -4,9 +4,11 @@ import os
 import statistics
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
+from numba import njit
 
 from canwall import config
 from canwall.sweep import make_plan
@@ -89,6 +91,19 @@ def _plain_strike() -> None:
         sent = force
 
 
+@njit(nogil=True)  # type: ignore[untyped-decorator]
+def _spin(rounds: int) -> float:
+    x = 0.0
+    for i in range(rounds):
+        x = (x * 1.0000001 + i) % 3.7
+    return x
+
+
+def _spun(cores: int) -> None:
+    with ThreadPoolExecutor(cores) as pool:
+        list(pool.map(_spin, [10_000_000] * 4))
+
+
 def sweep_on_two_cores() -> dict[str, Any]:
     """The same map on one core and on two, and points per second of a Z-width map."""
     plan = _plan(
@@ -101,6 +116,8 @@ def sweep_on_two_cores() -> dict[str, Any]:
     )
     pieces = range(plan.pieces)
     list(computed(plan, pieces[:2], 1))
+    _spin(10)
+    bare = [_seconds(lambda cores=cores: _spun(cores), 3) for cores in (1, 2)]  # type: ignore[misc]
     one = _seconds(lambda: list(computed(plan, pieces, 1)), 3)
     two = _seconds(lambda: list(computed(plan, pieces, 2)), 3)
     return {
@@ -111,5 +128,7 @@ def sweep_on_two_cores() -> dict[str, Any]:
         "one_core_s": round(one, 2),
         "two_cores_s": round(two, 2),
         "two_cores_over_one": round(one / two, 2),
+        # What the machine gives at the time: a loop that touches nothing.
+        "bare_loop_two_cores_over_one": round(bare[0] / bare[1], 2),
         "processors": len(os.sched_getaffinity(0)),
     }
