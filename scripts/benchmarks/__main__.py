@@ -15,7 +15,7 @@ from on_the_ball import ball, law_steps, planning_steps
 from on_the_bus import exchange, simulated_drive, whole_loop
 from on_the_clock import several_drives, sync_jitter
 from on_the_drive import endurance
-from on_the_socket import full_cycles, round_trip, under_python
+from on_the_socket import full_cycles, round_trip, round_trip_on_vcan0, under_python
 from on_the_sweep import closed_loop, sweep_on_two_cores
 from ways_out import ways_out
 
@@ -36,8 +36,12 @@ BENCHMARKS: dict[str, Benchmark] = {
     "closed_loop": closed_loop,
     "sweep_on_two_cores": sweep_on_two_cores,
 }
-ON_REQUEST: dict[str, Benchmark] = {"endurance": endurance, "ways_out": ways_out}
-"""Minutes each, so they are run when they are named."""
+ON_REQUEST: dict[str, Benchmark] = {
+    "endurance": endurance,
+    "ways_out": ways_out,
+    "round_trip_on_vcan0": round_trip_on_vcan0,
+}
+"""Minutes each, or in need of SocketCAN, so they are run when they are named."""
 
 
 def main() -> None:
