@@ -33,7 +33,7 @@ import canwall.run.buses
 import canwall.run.running
 from canwall import config
 from canwall.cycle import make_cycle, run_laws, set_wall, step
-from canwall.cycle.step import start_at
+from canwall.cycle.state import start_at
 from canwall.drive import DriveSetup, Field, PdoLayout
 from canwall.errors import RunFailedError
 from canwall.record import ROW, Phase, Recorder

@@ -8,18 +8,11 @@ from canwall.cycle.loop import Outcome, run_loop
 from canwall.cycle.machine import real_time_machine
 from canwall.cycle.native import NativeExchange
 from canwall.cycle.realtime import Grant, real_time_priority
-from canwall.cycle.step import (
-    CYCLE,
-    MAX_LAWS,
-    Trip,
-    fade_in,
-    make_cycle,
-    set_wall,
-    start_at,
-    step,
-)
+from canwall.cycle.state import CYCLE, MAX_LAWS, fade_in, make_cycle, set_wall, start_at
+from canwall.cycle.step import step
 from canwall.cycle.sync import ExternalSync, ProducedSync
 from canwall.cycle.timing import HISTOGRAM, buckets_ns, observe_ns, percentile_ns, timing_summary
+from canwall.cycle.trips import Trip
 from canwall.cycle.watch import Watch
 
 __all__ = [

@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.config import Limits, Settings, Wall
-from canwall.cycle.step import SYNCHRONOUS_DELAY, Trip, make_cycle
+from canwall.cycle.state import SYNCHRONOUS_DELAY, make_cycle
 from canwall.cycle.timing import HISTOGRAM
+from canwall.cycle.trips import Trip
 from canwall.drive import DriveNode, DriveSetup
 from canwall.record import ROW, Mailbox, Phase, Ring
 from canwall.walls import Law

@@ -1,7 +1,7 @@
 """The laws that one run may render its wall by."""
 
 from canwall.config import ConfigError, Settings
-from canwall.cycle.step import MAX_LAWS
+from canwall.cycle.state import MAX_LAWS
 from canwall.walls import Law, UnknownLawError, find_law
 
 

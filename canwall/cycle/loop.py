@@ -16,7 +16,9 @@ from canwall import config
 from canwall.cycle.axis import Axis, Change
 from canwall.cycle.delay import DelayTest
 from canwall.cycle.exchange import Exchange
-from canwall.cycle.step import Trip, fade_in, fade_over, set_delay, set_limits, set_wall, start_at
+from canwall.cycle.state import fade_in, fade_over, set_delay, set_limits, set_wall, start_at
+from canwall.cycle.trip_text import latest_emergency, shown_state, trip_text
+from canwall.cycle.trips import Trip
 from canwall.drive import (
     Controlword,
     DriveError,
@@ -26,7 +28,6 @@ from canwall.drive import (
     disable,
     disarm,
     state_of,
-    status_text,
 )
 from canwall.drive import objects as od
 from canwall.record import Phase
@@ -161,7 +162,7 @@ class _Loop:
                 return
             for axis, way in zip(self._axes, ways, strict=True):
                 if way.in_vain:
-                    returns = f"the fault comes back after every reset{_emergency(axis)}"
+                    returns = f"the fault comes back after every reset{latest_emergency(axis)}"
                     raise _WallGivenUpError(self._say(axis, returns))
                 if _is_silent(axis):
                     silent = f"no TPDO for {_SILENT_CYCLES} cycles while enabling"
@@ -170,7 +171,7 @@ class _Loop:
             self._check()
         for axis, way in zip(self._axes, ways, strict=True):
             if not _is_enabled(axis, way):
-                stays = f"the drive stays in {_state(axis)}{_emergency(axis)}"
+                stays = f"the drive stays in {shown_state(axis)}{latest_emergency(axis)}"
                 raise _WallGivenUpError(self._say(axis, stays))
 
     def _first_positions(self) -> None:
@@ -248,7 +249,7 @@ class _Loop:
     def _check(self) -> None:
         for axis in self._axes:
             if axis.cycle["trip"][0]:
-                raise _WallGivenUpError(self._say(axis, _trip_text(axis, self._exchange)))
+                raise _WallGivenUpError(self._say(axis, trip_text(axis, self._exchange)))
 
     def leave(self) -> bool:
         """Zero torque and the state machines down; whether the drives confirmed it."""
@@ -347,83 +348,3 @@ def _is_down(axis: Axis) -> bool:
 
 def _is_silent(axis: Axis) -> bool:
     return bool(axis.cycle["missed_in_a_row"][0] >= _SILENT_CYCLES)
-
-
-def _state(axis: Axis) -> str:
-    return status_text(int(axis.cycle["statusword"][0]))
-
-
-def _emergency(axis: Axis) -> str:
-    if not axis.node.emergencies:
-        return ""
-    latest = axis.node.emergencies[-1]
-    return f"; EMCY {latest.code:#06x} ({latest.get_desc() or 'no description'})"
-
-
-def _trip_text(axis: Axis, exchange: Exchange) -> str:
-    cycle, row = axis.cycle[0], axis.row[0]
-    j = int(row["j"])
-    trip = Trip(int(cycle["trip"]))
-    match trip:
-        case Trip.SPEED:
-            speed = float(cycle["estimator"]["v"][0])
-            what = f"speed {speed:.3g} rad/s beyond limits.speed_rad_s"
-        case Trip.POSITION:
-            what = f"position {float(row['position_rad']):.4g} rad outside limits.position_rad"
-        case Trip.JUMP:
-            what = (
-                f"the position jumped by {abs(float(cycle['innovation'])):.3g} rad, more than "
-                f"{_jump_key(axis)} allows: look to the encoder and its cable"
-            )
-        case Trip.STUCK:
-            what = (
-                f"the position has not changed for {int(cycle['frozen'])} cycles, in which the "
-                f"handle should have moved by {abs(float(cycle['motion_missed'])):.2g} rad "
-                f"(limits.stuck_rad): look to the encoder"
-            )
-        case Trip.TORQUE:
-            what = (
-                f"the drive's torque (0x6077) has been {float(cycle['torque_error']):.3g} N·m off "
-                f"the target torque for {int(cycle['unfollowed'])} cycles, beyond "
-                f"limits.torque_error_nm"
-            )
-        case Trip.ENERGY:
-            energy = float(cycle["energy_out"])
-            what = f"the wall has put out {energy:.3g} J in this contact, beyond limits.energy_j"
-        case Trip.MISSED_TPDO:
-            what = f"no TPDO for {int(cycle['missed_in_a_row'])} cycles{_too_short(axis)}"
-        case Trip.NOT_ENABLED:
-            what = f"the drive left OPERATION ENABLED: {_state(axis)}{_emergency(axis)}"
-        case Trip.REPORTED:
-            what = axis.reported
-        case _:
-            law = axis.laws[int(cycle["rendered"]["law"][0])].name
-            what = f"law {law} failed, or gave a force that is not a number"
-    if trip in (Trip.NOT_ENABLED, Trip.REPORTED):
-        what += _pause(axis, exchange)
-    return f"cycle {j} ({j * float(cycle['period']):.3f} s): {what}"
-
-
-def _jump_key(axis: Axis) -> str:
-    return "limits.jump_rad" if axis.limits.jump_rad else "limits.speed_rad_s"
-
-
-def _too_short(axis: Axis) -> str:
-    if axis.wrong_length is None:
-        return ""
-    tpdo = axis.setup.tpdo
-    return (
-        f" (0x{tpdo.cob_id:03X} came with {axis.wrong_length} bytes, {tpdo.length} carry what is "
-        f"mapped)"
-    )
-
-
-def _pause(axis: Axis, exchange: Exchange) -> str:
-    """Why a drive has left where it was its master that was not there."""
-    watchdog, pause_s = axis.setup.watchdog, exchange.longest_pause_s()
-    if pause_s <= watchdog.time_s:
-        return ""
-    return (
-        f"; the master had stood still for {pause_s:.3g} s, the drive's watchdog "
-        f"({watchdog.kind}) waits for {watchdog.time_s * 1e3:g} ms"
-    )

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
 from canwall.cycle.exchange import BACKLOG
-from canwall.cycle.step import CYCLE, step
+from canwall.cycle.state import CYCLE
+from canwall.cycle.step import step
 from canwall.cycle.sync import SPIN_NS
 from canwall.cycle.timing import HISTOGRAM, observe_ns
 from canwall.rawcan import (

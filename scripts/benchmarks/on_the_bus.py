@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from canwall import config, simdrive
 from canwall.config import Settings
 from canwall.cycle import Axis, PythonCanExchange, run_laws, step
-from canwall.cycle.step import start_at
+from canwall.cycle.state import start_at
 from canwall.drive import REQUIRED_OBJECTS, DriveNode, DriveSetup, Link, set_up
 from canwall.eds import load_eds
 from canwall.record import ROW, Phase, Recorder, Ring

@@ -7,7 +7,7 @@ from rig import Loop, RigFactory, settings_with
 from test_step import Wall
 
 from canwall.cycle import Change
-from canwall.cycle.step import fade_in, fade_over, set_limits, set_wall, start_at
+from canwall.cycle.state import fade_in, fade_over, set_limits, set_wall, start_at
 from canwall.record import Phase
 
 PRESSING = 500

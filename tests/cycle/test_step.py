@@ -12,7 +12,7 @@ from rig import settings_with
 
 from canwall.config import Settings
 from canwall.cycle import Trip, make_cycle, run_laws, set_wall, step
-from canwall.cycle.step import start_at
+from canwall.cycle.state import start_at
 from canwall.drive import DriveSetup, Field, PdoLayout
 from canwall.record import ROW, Phase
 from canwall.units import DriveUnits

@@ -1,0 +1,265 @@
+"""The record of one wall on one drive: settings, state and results, and what sets them.
+
+The step (`step.py`) works on it; what is set here is set between two cycles.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canwall.config import Limits, Settings, Wall
+from canwall.drive import DriveSetup, PdoLayout
+from canwall.drive import objects as od
+from canwall.metrics import STRIKE_GAP_S
+from canwall.walls import (
+    ESTIMATOR,
+    TENSION,
+    WALL,
+    Law,
+    find_law,
+    forget,
+    reset_estimator,
+    set_estimator,
+    set_plant,
+    set_referent,
+)
+
+#: Laws among which a run can change.
+MAX_LAWS = 16
+
+#: Delay of a torque carried by a synchronous RPDO (theory, section 3).
+SYNCHRONOUS_DELAY = 1.0
+
+#: A coarse encoder rests on one count for long: less than so many counts are no motion missed.
+_STUCK_COUNTS = 8
+#: Rounding may be a count on either side of a cycle.
+_JUMP_COUNTS = 2
+#: Without [limits] torque_error_nm: parts of torque_nm, and per mille of the rated torque.
+_TORQUE_ERROR_PART, _TORQUE_ERROR_PER_MILLE = 0.1, 50.0
+
+_FIELD = [("shift", "i8"), ("bits", "i8")]
+
+#: No law: a wall that is not there and gives no force.
+NO_LAW = -1
+
+#: A wall on the drive's axis, and the law that renders it.
+RENDERED = np.dtype(
+    [
+        ("law", "i8"),  # index into the laws of the cycle
+        ("position", "f8"),
+        ("estimated_velocity", "?"),
+        ("divider", "i8"),  # the law is asked every so many cycles
+        ("wall", WALL, (1,)),
+        # State: cycles since the law was asked, its force, its sample, the time since then.
+        ("waited", "i8"),
+        ("force", "f8"),
+        ("y_before", "f8"),
+        ("elapsed", "f8"),
+    ],
+    align=True,
+)
+
+#: Settings, state and results of one wall on one drive.
+CYCLE = np.dtype(
+    [
+        # Where the values lie in the frames' data; bits = 0: not carried.
+        ("in_position", _FIELD, (1,)),
+        ("in_statusword", _FIELD, (1,)),
+        ("in_torque", _FIELD, (1,)),
+        ("out_controlword", _FIELD, (1,)),
+        ("out_torque", _FIELD, (1,)),
+        # Scales and limits.
+        ("period", "f8"),
+        ("rad_per_count", "f8"),
+        ("nm_per_mille", "f8"),
+        ("drive_torque_limit", "f8"),
+        ("torque_limit", "f8"),
+        ("torque_rate", "f8"),
+        ("speed_limit", "f8"),
+        ("position_low", "f8"),
+        ("position_high", "f8"),
+        ("energy_limit", "f8"),
+        ("jump_limit", "f8"),
+        ("stuck_limit", "f8"),
+        ("stuck_cycles", "i8"),
+        ("torque_error_limit", "f8"),
+        ("torque_error_cycles", "i8"),
+        ("hold_cycles", "i8"),
+        ("ramp_cycles", "i8"),
+        ("strike_gap", "i8"),
+        # The wall, and the one that it takes over from, cycle by cycle.
+        ("orientation", "f8"),
+        ("laws", "u8", (MAX_LAWS,)),
+        ("rendered", RENDERED, (1,)),
+        ("faded", RENDERED, (1,)),
+        ("fade_cycles", "i8"),
+        ("fade_left", "i8"),
+        ("estimator", ESTIMATOR, (1,)),
+        # What the loop asks for.
+        ("phase", "i8"),
+        ("controlword", "i8"),
+        ("test_per_mille", "i8"),
+        # State.
+        ("j", "i8"),
+        ("counts", "i8"),
+        ("statusword", "i8"),
+        ("torque_actual", "i8"),
+        ("torque_per_mille", "i8"),
+        ("missed_in_a_row", "i8"),
+        # Whether the estimator knows where the handle is, and how far off it was this time.
+        ("started", "?"),
+        ("innovation", "f8"),
+        # Cycles since the position last changed, its last changes before [counts per cycle], and
+        # the motion that was missed in them.
+        ("frozen", "i8"),
+        ("change", "i8"),
+        ("change_before", "i8"),
+        ("motion_missed", "f8"),
+        # Highest and lowest torque commanded of late [per mille]; cycles for which the torque
+        # actual value has been outside of them, and how far [N·m].
+        ("highest_sent", "f8"),
+        ("lowest_sent", "f8"),
+        ("unfollowed", "i8"),
+        ("torque_error", "f8"),
+        ("oriented", "f8"),
+        ("force_applied", "f8"),
+        ("energy_out", "f8"),
+        ("touched", "?"),
+        ("outside", "i8"),
+        # Results.
+        ("trip", "i8"),
+        ("missed_tpdo", "i8"),
+        ("strikes", "i8"),
+    ],
+    align=True,
+)
+
+
+def make_cycle(settings: Settings, setup: DriveSetup, laws: Sequence[Law]) -> NDArray[np.void]:
+    """The record of one wall, ready for its first cycle; shape (1,), dtype CYCLE.
+
+    `laws` are the laws of the run; a row's `law` is an index into them. Raises UnknownLawError
+    for options that a law does not have.
+    """
+    cycle = np.zeros(1, CYCLE)
+    for name, layout, index in (
+        ("in_position", setup.tpdo, od.POSITION_ACTUAL_VALUE),
+        ("in_statusword", setup.tpdo, od.STATUSWORD),
+        ("in_torque", setup.tpdo, od.TORQUE_ACTUAL_VALUE),
+        ("out_controlword", setup.rpdo, od.CONTROLWORD),
+        ("out_torque", setup.rpdo, od.TARGET_TORQUE),
+    ):
+        _set_field(cycle, name, layout, index)
+    period = settings.bus.cycle_s
+    cycle["period"] = period
+    cycle["rad_per_count"] = setup.units.rad_per_count
+    cycle["nm_per_mille"] = setup.units.nm_per_mille
+    cycle["strike_gap"] = round(STRIKE_GAP_S / period)
+    cycle["drive_torque_limit"] = setup.torque_limit_nm
+    for i, law in enumerate(laws):
+        cycle["laws"][0, i] = law.address
+    delay = settings.estimator.delay_cycles
+    set_delay(cycle, settings, SYNCHRONOUS_DELAY if delay is None else delay)
+    set_limits(cycle, settings.limits)
+    set_plant(cycle["rendered"][0]["wall"][0], *_model(settings), period)
+    cycle["rendered"]["law"] = NO_LAW
+    set_wall(cycle, settings.wall, laws)
+    return cycle
+
+
+def _model(settings: Settings) -> tuple[float, float, float]:
+    """Mass, viscous damping and spring of `[mechanics]`."""
+    mechanics = settings.mechanics
+    return mechanics.inertia_kg_m2, mechanics.viscous_nm_s_per_rad, mechanics.spring_nm_per_rad
+
+
+def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None:
+    """Write the estimator for a delay of `delay` periods; it starts anew. Raises ValueError."""
+    set_estimator(
+        cycle["estimator"][0],
+        *_model(settings),
+        settings.mechanics.coulomb_nm,
+        settings.bus.cycle_s,
+        count=float(cycle["rad_per_count"][0]),
+        force_walk=settings.estimator.force_walk_nm_per_sqrt_s,
+        delay=delay,
+    )
+    reset_estimator(cycle["estimator"][0], float(cycle["oriented"][0]))
+
+
+def _set_field(cycle: NDArray[np.void], name: str, layout: PdoLayout, index: int) -> None:
+    field = layout.field(index)
+    if field is not None:
+        cycle[name]["shift"], cycle[name]["bits"] = field.shift, field.bits
+
+
+def set_limits(cycle: NDArray[np.void], limits: Limits) -> None:
+    """Change the limits between two cycles."""
+    cycle["torque_limit"] = min(limits.torque_nm, cycle["drive_torque_limit"].item())
+    cycle["torque_rate"] = limits.torque_rate_nm_per_s or math.inf
+    cycle["speed_limit"] = limits.speed_rad_s
+    cycle["position_low"], cycle["position_high"] = limits.position_rad
+    cycle["energy_limit"] = limits.energy_j or math.inf
+    period, count = cycle["period"].item(), cycle["rad_per_count"].item()
+    jump = limits.jump_rad or limits.speed_rad_s * period
+    cycle["jump_limit"] = jump + _JUMP_COUNTS * abs(count)
+    stuck = max(limits.stuck_rad, _STUCK_COUNTS * abs(count))
+    cycle["stuck_limit"] = stuck if limits.stuck_rad else math.inf
+    cycle["stuck_cycles"] = limits.stuck_cycles
+    error = limits.torque_error_nm
+    if error is None:
+        rated_part = _TORQUE_ERROR_PER_MILLE * abs(cycle["nm_per_mille"].item())
+        error = max(_TORQUE_ERROR_PART * limits.torque_nm, rated_part)
+    cycle["torque_error_limit"] = error or math.inf
+    cycle["torque_error_cycles"] = limits.torque_error_cycles
+    cycle["hold_cycles"] = limits.hold_cycles
+    cycle["ramp_cycles"] = limits.ramp_cycles
+
+
+def set_wall(cycle: NDArray[np.void], wall: Wall, laws: Sequence[Law]) -> None:
+    """Change the wall between two cycles; its law is one of `laws`. Raises UnknownLawError."""
+    law = find_law(wall.law, wall.deadbeat)
+    options = law.option_values(wall.options)
+    index = [known.name for known in laws].index(law.name)
+    cycle["orientation"] = 1.0 if wall.side == "below" else -1.0
+    rendered = cycle["rendered"][0]
+    known = rendered["wall"][0]
+    rendered["position"] = wall.position_rad
+    rendered["estimated_velocity"] = wall.velocity == "estimated"
+    if wall.divider != rendered["divider"]:
+        # The law's torques are held for as long as it is not asked again.
+        rendered["divider"] = rendered["waited"] = wall.divider
+        mass, viscous, spring = (known[name].item() for name in ("mass", "viscous", "spring"))
+        set_plant(known, mass, viscous, spring, cycle["period"].item() * wall.divider)
+    set_referent(known, wall.stiffness_nm_per_rad, wall.damping_nm_s_per_rad, options)
+    known["tension"] = TENSION[wall.tension]
+    known["passivity_damping"] = wall.passivity_nm_s_per_rad
+    if index != rendered["law"]:
+        rendered["law"] = index
+        forget(known)
+
+
+def fade_over(cycle: NDArray[np.void], cycles: int) -> None:
+    """Let the wall as it is now give way to what is set next, without a bump, within `cycles`.
+
+    To be called before `set_wall`. Force and wall change places linearly; where neither gives a
+    force there is nothing to fade.
+    """
+    cycle["faded"] = cycle["rendered"]
+    cycle["fade_cycles"] = cycle["fade_left"] = cycles
+
+
+def fade_in(cycle: NDArray[np.void], cycles: int) -> None:
+    """Let the wall come up out of nothing within `cycles`: the handle may be inside it."""
+    fade_over(cycle, cycles)
+    cycle["faded"]["law"] = NO_LAW
+
+
+def start_at(cycle: NDArray[np.void], counts: int) -> None:
+    """Begin at rest at a position: the first that the drive reports."""
+    oriented = cycle["orientation"][0] * counts * cycle["rad_per_count"][0]
+    reset_estimator(cycle["estimator"][0], oriented)
+    cycle["oriented"] = cycle["rendered"]["y_before"] = oriented
+    cycle["started"] = True

@@ -1,0 +1,89 @@
+"""What ended a wall, in words: what, when, by how much, and where to look."""
+
+from canwall.cycle.axis import Axis
+from canwall.cycle.exchange import Exchange
+from canwall.cycle.trips import Trip
+from canwall.drive import status_text
+
+
+def shown_state(axis: Axis) -> str:
+    """The state that the drive's latest statusword shows."""
+    return status_text(int(axis.cycle["statusword"][0]))
+
+
+def latest_emergency(axis: Axis) -> str:
+    """The drive's latest EMCY, to be put behind what came of it; empty if there was none."""
+    if not axis.node.emergencies:
+        return ""
+    latest = axis.node.emergencies[-1]
+    return f"; EMCY {latest.code:#06x} ({latest.get_desc() or 'no description'})"
+
+
+def trip_text(axis: Axis, exchange: Exchange) -> str:
+    """The trip that is set: its cycle, its value, and the key that it has passed."""
+    cycle, row = axis.cycle[0], axis.row[0]
+    j = int(row["j"])
+    trip = Trip(int(cycle["trip"]))
+    match trip:
+        case Trip.SPEED:
+            speed = float(cycle["estimator"]["v"][0])
+            what = f"speed {speed:.3g} rad/s beyond limits.speed_rad_s"
+        case Trip.POSITION:
+            what = f"position {float(row['position_rad']):.4g} rad outside limits.position_rad"
+        case Trip.JUMP:
+            what = (
+                f"the position jumped by {abs(float(cycle['innovation'])):.3g} rad, more than "
+                f"{_jump_key(axis)} allows: look to the encoder and its cable"
+            )
+        case Trip.STUCK:
+            what = (
+                f"the position has not changed for {int(cycle['frozen'])} cycles, in which the "
+                f"handle should have moved by {abs(float(cycle['motion_missed'])):.2g} rad "
+                f"(limits.stuck_rad): look to the encoder"
+            )
+        case Trip.TORQUE:
+            what = (
+                f"the drive's torque (0x6077) has been {float(cycle['torque_error']):.3g} N·m off "
+                f"the target torque for {int(cycle['unfollowed'])} cycles, beyond "
+                f"limits.torque_error_nm"
+            )
+        case Trip.ENERGY:
+            energy = float(cycle["energy_out"])
+            what = f"the wall has put out {energy:.3g} J in this contact, beyond limits.energy_j"
+        case Trip.MISSED_TPDO:
+            what = f"no TPDO for {int(cycle['missed_in_a_row'])} cycles{_too_short(axis)}"
+        case Trip.NOT_ENABLED:
+            what = f"the drive left OPERATION ENABLED: {shown_state(axis)}{latest_emergency(axis)}"
+        case Trip.REPORTED:
+            what = axis.reported
+        case _:
+            law = axis.laws[int(cycle["rendered"]["law"][0])].name
+            what = f"law {law} failed, or gave a force that is not a number"
+    if trip in (Trip.NOT_ENABLED, Trip.REPORTED):
+        what += _pause(axis, exchange)
+    return f"cycle {j} ({j * float(cycle['period']):.3f} s): {what}"
+
+
+def _jump_key(axis: Axis) -> str:
+    return "limits.jump_rad" if axis.limits.jump_rad else "limits.speed_rad_s"
+
+
+def _too_short(axis: Axis) -> str:
+    if axis.wrong_length is None:
+        return ""
+    tpdo = axis.setup.tpdo
+    return (
+        f" (0x{tpdo.cob_id:03X} came with {axis.wrong_length} bytes, {tpdo.length} carry what is "
+        f"mapped)"
+    )
+
+
+def _pause(axis: Axis, exchange: Exchange) -> str:
+    """Why a drive has left where it was its master that was not there."""
+    watchdog, pause_s = axis.setup.watchdog, exchange.longest_pause_s()
+    if pause_s <= watchdog.time_s:
+        return ""
+    return (
+        f"; the master had stood still for {pause_s:.3g} s, the drive's watchdog "
+        f"({watchdog.kind}) waits for {watchdog.time_s * 1e3:g} ms"
+    )

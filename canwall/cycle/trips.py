@@ -1,0 +1,125 @@
+"""Why a wall is given up: the limits that are looked after within the step."""
+
+from enum import IntEnum
+
+from canwall.compiled import Record, compiled
+from canwall.drive import State
+from canwall.record import Phase
+
+
+class Trip(IntEnum):
+    """Why the wall was given up."""
+
+    NONE = 0
+    SPEED = 1
+    POSITION = 2
+    MISSED_TPDO = 3
+    NOT_ENABLED = 4
+    NOT_A_NUMBER = 5
+    ENERGY = 6
+    REPORTED = 7
+    """Something that came over the bus beside the cycle: EMCY, heartbeat, error frame."""
+    JUMP = 8
+    """A position far from where the handle can have gone since the one before."""
+    STUCK = 9
+    """A position that stays the same to the count though the handle is moving."""
+    TORQUE = 10
+    """A torque actual value (0x6077) that does not follow the target torque."""
+
+
+# The enums' values as plain numbers for the compiled code.
+_SPEED = int(Trip.SPEED)
+_POSITION = int(Trip.POSITION)
+_NOT_ENABLED = int(Trip.NOT_ENABLED)
+_ENERGY = int(Trip.ENERGY)
+_JUMP = int(Trip.JUMP)
+_STUCK = int(Trip.STUCK)
+_TORQUE = int(Trip.TORQUE)
+_LEAVING = int(Phase.LEAVING)
+_ENABLED_MASK, _ENABLED_VALUE = State.OPERATION_ENABLED.value
+#: Statusword bit 11, internal limit active: the drive says itself that it gives less.
+_INTERNAL_LIMIT = 1 << 11
+
+
+@compiled
+def watch(cycle: Record) -> None:
+    """Set the trip of a limit that is passed; one that is set stays."""
+    if cycle.trip:
+        return
+    position = cycle.counts * cycle.rad_per_count
+    if not cycle.position_low <= position <= cycle.position_high:
+        cycle.trip = _POSITION
+    elif cycle.frozen == cycle.stuck_cycles and _is_stuck(cycle):
+        cycle.trip = _STUCK
+    elif not abs(cycle.estimator[0].v) <= cycle.speed_limit:
+        cycle.trip = _SPEED
+    elif cycle.statusword & _ENABLED_MASK != _ENABLED_VALUE:
+        cycle.trip = _NOT_ENABLED
+    elif cycle.energy_out > cycle.energy_limit:
+        cycle.trip = _ENERGY
+    elif cycle.unfollowed >= cycle.torque_error_cycles:
+        cycle.trip = _TORQUE
+
+
+@compiled
+def _is_stuck(cycle: Record) -> bool:
+    """Whether a handle that does not move any more was going on a moment ago.
+
+    Two witnesses have to agree: the model, which knows the torques, but may have the wrong mass;
+    and the last two changes of the position, carried on: a handle that was stopped slowed down.
+    Three positions that are rounded to counts leave 3 counts open of the change to which they
+    carry on, 2·(y[j] − y[j−1]) − (y[j−1] − y[j−2]); the least of it counts.
+    """
+    last, before = abs(cycle.change), abs(cycle.change_before)
+    least = min(last - 1, 2 * last - before - 3)
+    went = least * abs(cycle.rad_per_count) * cycle.stuck_cycles
+    return min(went, abs(cycle.motion_missed)) > cycle.stuck_limit
+
+
+@compiled
+def compare_position(cycle: Record, change: int, missed: int) -> None:
+    """How far the position is from the one expected; a jump is a trip before it is made use of.
+
+    The estimator expects it where the torques on their way and the force estimated take the
+    handle, after `missed` cycles without a sample as well. `change`: of the position [counts].
+    """
+    cycle.innovation = cycle.oriented - cycle.estimator[0].y
+    if missed or not cycle.started:
+        cycle.change = cycle.change_before = 0
+        cycle.frozen = 0
+        cycle.motion_missed = 0.0
+    elif change:
+        cycle.change_before = cycle.change
+        cycle.change = change
+        cycle.frozen = 0
+        cycle.motion_missed = 0.0
+    else:
+        cycle.frozen += 1
+        if cycle.frozen <= cycle.stuck_cycles:
+            cycle.motion_missed -= cycle.innovation
+    jumped = not abs(cycle.innovation) <= cycle.jump_limit * (1 + missed)
+    if jumped and cycle.started and cycle.phase != _LEAVING and cycle.trip == 0:
+        position = cycle.counts * cycle.rad_per_count
+        inside = cycle.position_low <= position <= cycle.position_high
+        cycle.trip = _JUMP if inside else _POSITION
+
+
+@compiled
+def compare_torque(cycle: Record) -> None:
+    """Count the cycles in which 0x6077 is beyond everything that was commanded of late.
+
+    What is remembered of the commands fades within torque_error_cycles, so a current loop that
+    lags, or a torque actual value that is filtered, stays between its bounds.
+    """
+    sent = float(cycle.torque_per_mille)
+    fading = 2.0 / cycle.torque_error_cycles
+    cycle.highest_sent = max(sent, cycle.highest_sent + fading * (sent - cycle.highest_sent))
+    cycle.lowest_sent = min(sent, cycle.lowest_sent + fading * (sent - cycle.lowest_sent))
+    actual = float(cycle.torque_actual)
+    beyond = max(actual - cycle.highest_sent, cycle.lowest_sent - actual)
+    cycle.torque_error = beyond * abs(cycle.nm_per_mille)
+    limited = cycle.statusword & _INTERNAL_LIMIT
+    if cycle.torque_error > cycle.torque_error_limit and not limited:
+        cycle.unfollowed += 1
+    else:
+        cycle.unfollowed = 0
