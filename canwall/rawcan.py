@@ -53,10 +53,15 @@ _FRAME_SIZE = CAN_FRAME.itemsize
 #: What `receive` and `send` return besides 1, a frame: none now, the other side has gone, errno.
 FRAME, NOTHING, CLOSED, FAILED = 1, 0, -1, -2
 
+#: How long a network interface's transmit queue may stay full (ENOBUFS): one of ten frames empties
+#: in 11 ms at 125 kbit/s. No poll tells when there is room; it is tried again after so long.
+QUEUE_PATIENCE_NS, QUEUE_RETRY_NS = 50_000_000, 200_000
+
 _CLOCK_REALTIME, _CLOCK_MONOTONIC, _TIMER_ABSTIME = 0, 1, 1
 _POLLIN, _POLLOUT = 1, 4
 _NS_PER_S = 1_000_000_000
 _EAGAIN, _EINTR, _ECONNRESET = errno.EAGAIN, errno.EINTR, errno.ECONNRESET
+_ENOBUFS = errno.ENOBUFS
 _DONTWAIT = int(socket.MSG_DONTWAIT)
 _SEND_FLAGS = int(socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
 _SOL_SOCKET = socket.SOL_SOCKET
@@ -211,8 +216,10 @@ def send(
 ) -> int:
     """Send a frame: FRAME, or FAILED with `port.errno`.
 
-    While the transmit buffer is full (EAGAIN) it is waited for, no longer than `patience_ns`.
+    While the socket's transmit buffer is full (EAGAIN) it is waited for, no longer than
+    `patience_ns`; while the interface's queue is (ENOBUFS), no longer than QUEUE_PATIENCE_NS.
     """
+    queue_until = 0
     frame = port.frame[0]
     frame.can_id = can_id
     frame.length = length
@@ -222,6 +229,13 @@ def send(
             return FRAME
         port.errno = _errno()
         if port.errno == _EINTR:
+            continue
+        if port.errno == _ENOBUFS:
+            now = now_ns(port)
+            queue_until = queue_until or now + QUEUE_PATIENCE_NS
+            if now >= queue_until:
+                return FAILED
+            sleep_until(port, now + QUEUE_RETRY_NS)
             continue
         if port.errno != _EAGAIN or not _poll(port, descriptor, _POLLOUT, patience_ns):
             return FAILED

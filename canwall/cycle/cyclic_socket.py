@@ -6,7 +6,6 @@ between two ends or processes that carries the same packets lends its own descri
 """
 
 import contextlib
-import errno
 import os
 import socket
 import struct
@@ -15,6 +14,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import can
 
+from canwall.drive import reason
 from canwall.rawcan import RX_SOFTWARE_STAMPS, SO_TIMESTAMPING, SO_TIMESTAMPNS
 
 _STANDARD = 0x7FF
@@ -123,7 +123,7 @@ def _open(channel: str, received: Iterable[int]) -> socket.socket:
         sock.bind((channel,))
     except OSError as error:
         sock.close()
-        raise can.CanInitializationError(f"{channel}: {error.strerror}") from None
+        raise can.CanInitializationError(reason(error.errno or 0, channel)) from None
     return sock
 
 
@@ -142,17 +142,3 @@ def _take_back(bus: Any) -> None:
     bus.socket.setsockopt(socket.SOL_CAN_RAW, _JOIN_FILTERS, 0)
     bus.socket.setsockopt(socket.SOL_CAN_RAW, _ERR_FILTER, struct.pack("=I", _ALL_ERRORS))
     bus.set_filters(bus.filters)
-
-
-#: What went wrong with a frame, for a message; the system's own words for all else.
-_REASONS = {
-    errno.ENOBUFS: "transmit buffer full: nobody acknowledges, or txqueuelen is too small",
-    errno.EAGAIN: "transmit buffer full",
-    errno.ENETDOWN: "the interface is down",
-    errno.ENODEV: "the interface is gone",
-}
-
-
-def reason(number: int) -> str:
-    """An errno in words."""
-    return _REASONS.get(number, os.strerror(number))

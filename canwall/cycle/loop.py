@@ -111,7 +111,8 @@ def _leave(loop: "_Loop", outcome: Outcome) -> None:
         if not outcome.trips:
             outcome.trips.append("the drive does not follow its RPDOs any more; SDO disabled it")
     except can.CanError as error:
-        outcome.trips.append(f"the bus failed while leaving: {error}")
+        if f"the bus failed: {error}" not in outcome.trips:
+            outcome.trips.append(f"the bus failed while leaving: {error}")
     try:
         loop.disable_over_sdo()
         outcome.disabled = True

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from canwall.compiled import data_to_number
 from canwall.cycle.axis import Axis
 from canwall.cycle.beats import periods_ns
-from canwall.cycle.cyclic_socket import CyclicSocket, reason
+from canwall.cycle.cyclic_socket import CyclicSocket
 from canwall.cycle.exchange import Exchange
 from canwall.cycle.native_cycle import (
     AT_ONCE,
@@ -25,7 +25,7 @@ from canwall.cycle.native_cycle import (
     run,
 )
 from canwall.cycle.sync import SyncLostError, sync_patience_s
-from canwall.drive import Link
+from canwall.drive import Link, bus_error
 from canwall.drive.watchdog import Beat
 from canwall.rawcan import CFunction, place_port
 from canwall.record.ring import FRAME, HEADER, RECEIVED, Ring, to_message
@@ -219,7 +219,7 @@ class NativeExchange(Exchange):
                 self.descriptor = self._socket.descriptor
             raise can.CanOperationError("the other side of the bus has gone")
         number = int(self._exchange["port"]["errno"][0, 0])
-        raise can.CanOperationError(reason(number), number)
+        raise bus_error(number, self._link.bus)
 
     def close(self) -> None:
         """Close the socket of the cycle, where it has one of its own."""

@@ -55,13 +55,15 @@ class Watch:
 
     def _another_sync(self, can_id: int, data: bytearray, timestamp: float) -> None:
         for axis in self._axes:
-            axis.give_up(f"somebody else sends SYNC ({can_id:#05x}) as well")
+            axis.give_up(
+                f"somebody else sends SYNC ({can_id:#05x}) as well: end it, or set bus.sync"
+            )
 
     def _error_frame(self, message: can.Message) -> None:
         self.error_frames += 1
         if message.arbitration_id & _BUS_OFF:
             for axis in self._axes:
-                axis.give_up("the adapter is bus-off")
+                axis.give_up("the adapter is bus-off: look at bit rate, cable and termination")
 
     def _axis(self, node_id: int) -> Axis:
         return next(axis for axis in self._axes if axis.node.node_id == node_id)

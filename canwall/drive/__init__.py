@@ -3,6 +3,7 @@
 One python-can bus, one thread: what waits for an answer reads the bus itself.
 """
 
+from canwall.drive.bus_errors import bus_error, reason
 from canwall.drive.cia402 import (
     Controlword,
     Enabling,
@@ -33,10 +34,12 @@ __all__ = [
     "PdoLayout",
     "State",
     "Watchdog",
+    "bus_error",
     "controlword_down",
     "controlword_up",
     "disable",
     "disarm",
+    "reason",
     "refuse_second_master",
     "set_up",
     "state_of",

@@ -17,7 +17,8 @@ import canopen
 from canopen.sdo import SdoClient
 from canopen.sdo.exceptions import SdoCommunicationError
 
-from canwall.rawcan import CFunction
+from canwall.drive.bus_errors import explained
+from canwall.rawcan import QUEUE_PATIENCE_NS, QUEUE_RETRY_NS, CFunction
 
 # What fails is raised; canopen logs it as well, which without a handler goes to stderr.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
@@ -28,10 +29,6 @@ _ANSWERS = {0: 1, 1: 3, 2: 2, 3: 0}
 _ABORT = 4
 #: Requests whose answer repeats index and subindex.
 _INITIATE = (1, 2)
-
-#: How long a transmit queue may stay full: one of ten frames empties in 11 ms at 125 kbit/s.
-_QUEUE_PATIENCE_S = 0.05
-_QUEUE_RETRY_S = 0.0002
 
 #: Takes note of a frame: time [s], message, whether it was received (else sent).
 FrameLog = Callable[[float, can.Message, bool], None]
@@ -64,33 +61,30 @@ class Link:
             self.bus.send(message)
         except can.CanOperationError as error:
             if error.error_code != errno.ENOBUFS:
-                raise
+                raise explained(error, self.bus) from None
             self._send_when_there_is_room(message)
         if self.log is not None:
             self.log(time.time(), message, False)
 
     def _send_when_there_is_room(self, message: can.Message) -> None:
         # python-can gives up at once: such a socket always seems ready to be written.
-        deadline = time.monotonic() + _QUEUE_PATIENCE_S
-        while time.monotonic() < deadline:
-            time.sleep(_QUEUE_RETRY_S)
+        deadline_ns = time.monotonic_ns() + QUEUE_PATIENCE_NS
+        while True:
+            time.sleep(QUEUE_RETRY_NS * 1e-9)
             try:
                 self.bus.send(message)
                 return
             except can.CanOperationError as error:
-                if error.error_code != errno.ENOBUFS:
-                    raise
-        raise can.CanOperationError(
-            f"the transmit queue stays full for {_QUEUE_PATIENCE_S * 1e3:.0f} ms; does anybody "
-            "acknowledge, at this bit rate, is there too much on the bus, or is the interface's "
-            "txqueuelen below what is sent in a cycle?",
-            errno.ENOBUFS,
-        )
+                if error.error_code != errno.ENOBUFS or time.monotonic_ns() >= deadline_ns:
+                    raise explained(error, self.bus) from None
 
     def receive(self, timeout_s: float) -> can.Message | None:
         """The next frame, or None if there is none within the time. Raises can.CanError."""
         idle = self.idle
-        message = self.bus.recv(timeout_s) if idle is None else self._receive_idling(timeout_s)
+        try:
+            message = self.bus.recv(timeout_s) if idle is None else self._receive_idling(timeout_s)
+        except can.CanOperationError as error:
+            raise explained(error, self.bus) from None
         if message is not None and self.log is not None:
             self.log(message.timestamp, message, True)
         return message

@@ -28,5 +28,6 @@ def refuse_second_master(link: Link, bus: BusSettings, node_ids: Iterable[int]) 
     if heard is not None:
         sign = heard.arbitration_id
         raise DriveError(
-            f"another master is on the bus: it sends {signs[sign]} ({sign:#05x}); end it first"
+            f"another master is on {bus.channel}: it sends {signs[sign]} ({sign:#05x}); "
+            "end it first"
         )

@@ -8,7 +8,7 @@ import can
 
 from canwall import simdrive
 from canwall.config import ConfigError, Settings
-from canwall.drive import Link, refuse_second_master
+from canwall.drive import Link, reason, refuse_second_master
 from canwall.pair import pair
 
 
@@ -18,9 +18,12 @@ def open_bus(settings: Settings) -> can.BusABC:
     try:
         return can.Bus(interface=bus.interface, channel=bus.channel, bitrate=bus.bitrate)
     except (can.CanError, OSError, ValueError, ImportError, TypeError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        if isinstance(error, OSError) and error.errno is not None:
+            why = reason(error.errno, bus.channel)
+        else:
+            why = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ConfigError(
-            f"bus.interface = {bus.interface!r}, bus.channel = {bus.channel!r}: {reason}"
+            f"bus.interface = {bus.interface!r}, bus.channel = {bus.channel!r}: {why}"
         ) from None
 
 

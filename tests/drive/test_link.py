@@ -148,7 +148,8 @@ class FullQueue(VirtualBus):
 
     def __init__(self, channel: str, attempts: float, code: int = errno.ENOBUFS) -> None:
         super().__init__(channel)
-        self.attempts, self.code = attempts, code
+        # Of the sort that SocketCAN has.
+        self.attempts, self.code, self.channel_info = attempts, code, channel
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         if self.attempts > 0:
@@ -172,19 +173,42 @@ def test_full_queue_is_waited_for() -> None:
 
 def test_queue_that_stays_full_is_an_error() -> None:
     noted: list[int] = []
-    with FullQueue("stays full", math.inf) as bus:
+    with FullQueue("can7", math.inf) as bus:
         link = Link(bus)
         link.log = lambda time_s, message, received: noted.append(message.arbitration_id)
-        with pytest.raises(can.CanOperationError, match="the transmit queue stays full for 50 ms"):
+        with pytest.raises(
+            can.CanOperationError,
+            match="the transmit queue of can7 stays full: does anybody acknowledge",
+        ):
             link.send(can.Message(arbitration_id=0x205, is_extended_id=False))
     assert noted == []
 
 
 def test_another_error_is_not_waited_for() -> None:
-    with FullQueue("down", 1, errno.ENETDOWN) as bus:
-        with pytest.raises(can.CanOperationError, match="Failed to transmit"):
+    with FullQueue("can7", 1, errno.ENETDOWN) as bus:
+        with pytest.raises(
+            can.CanOperationError, match="can7 is down; as root: ip link set can7 up"
+        ):
             Link(bus).send(can.Message(arbitration_id=0x205, is_extended_id=False))
         assert bus.attempts == 0
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        (errno.ENODEV, "there is no interface can7; `ip link` shows which there are"),
+        (errno.EIO, f"Failed to receive [Error Code {errno.EIO}]"),
+    ],
+)
+def test_what_fails_to_be_received_is_said_in_words(code: int, words: str) -> None:
+    def fail(timeout: float | None = None) -> None:
+        raise can.CanOperationError("Failed to receive", code)
+
+    with FullQueue("can7", 0) as bus:
+        bus.recv = fail  # type: ignore[method-assign]
+        with pytest.raises(can.CanOperationError) as raised:
+            Link(bus).receive(0.0)
+    assert str(raised.value) == words
 
 
 def test_a_short_number_in_29_bits_is_another_identifier(rig: Rig) -> None:

@@ -1,14 +1,27 @@
 """A bench on vcan0 for each test, and the runs that several of them look at."""
 
+import functools
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 from commands import Record
 from rig import Loop, Rig, settings_with
-from socketcan import PATIENCE_S, Bench, Canwall, has_socketcan, is_up, wait_for
+from socketcan import (
+    PATIENCE_S,
+    Bench,
+    Canwall,
+    has_socketcan,
+    is_up,
+    light,
+    wait_for,
+)
+
+import canwall.run
+
+EXCHANGES = ("native", "python-can")
 
 _WHY_NOT = (
     "the kernel has no SocketCAN (PF_CAN); scripts/vcan-guest python -m pytest tests/vcan"
@@ -29,20 +42,29 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def loaded() -> None:
-    """Have what is compiled loaded here, so that every process forked from this one has it.
+def loaded(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Have what is needed loaded here, so that every process forked from this one has it.
 
     It takes an emulated processor seconds, which the first TPDO would come too late by.
     """
     if not _WHY_NOT:
-        rig = Rig(settings_with())
+        rig = Rig(settings_with(), native=True)
         Loop(rig).run(300)
         rig.close()
+        with light():
+            settings = settings_with({"run.duration_s": 0.3})
+            canwall.run.run(settings, tmp_path_factory.mktemp("loaded") / "run")
+
+
+@pytest.fixture(scope="session", params=EXCHANGES)
+def exchange(request: pytest.FixtureRequest) -> str:
+    """`[bus] exchange`: each of them in turn."""
+    return str(request.param)
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
-    bench = Bench(tmp_path)
+def bench(tmp_path: Path, exchange: str) -> Iterator[Bench]:
+    bench = Bench(tmp_path, exchange)
     yield bench
     bench.close()
 
@@ -59,10 +81,19 @@ class Strikes:
 
 
 @pytest.fixture(scope="session")
-def strikes(tmp_path_factory: pytest.TempPathFactory) -> Strikes:
+def strikes_by(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Strikes]:
+    """The strikes by an exchange, run once."""
+    return functools.cache(lambda exchange: _strike(tmp_path_factory.mktemp("strikes"), exchange))
+
+
+@pytest.fixture(scope="session")
+def strikes(strikes_by: Callable[[str], Strikes], exchange: str) -> Strikes:
+    return strikes_by(exchange)
+
+
+def _strike(folder: Path, exchange: str) -> Strikes:
     """Four strikes; candump, a load from cangen, cansend and a second master beside them."""
-    folder = tmp_path_factory.mktemp("strikes")
-    bench = Bench(folder)
+    bench = Bench(folder, exchange)
     drive = bench.drive()
     candump = folder / "candump.log"
     dump = bench.start("candump", "-L", "vcan0", output=candump)

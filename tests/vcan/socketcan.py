@@ -17,7 +17,9 @@ import can
 import pytest
 from commands import config_file, torque_is_on
 
-import canwall.run  # noqa: F401 (loaded here, it is there in every process)
+import canwall.record.recorder
+import canwall.record.writer
+import canwall.run.running
 from canwall import cli, config
 from canwall.drive import State, state_of
 
@@ -26,7 +28,18 @@ VCAN_CONFIG = config.shipped("config/vcan.toml")
 #: A guest under emulation, on a machine that has other things to do, takes its time.
 PATIENCE_S = 200.0
 
-#: Changes of config/vcan.toml: a hand that leans on the wall, until the run ends by itself.
+#: Changes of config/vcan.toml: SYNCs of a rate that an emulated processor keeps beside whatever
+#: else its machine does, and a wall that bears it.
+SLOW = {
+    "cycle_s = 0.001": 'cycle_s = 0.05\npace = "real_time"',
+    "wait_s = 5.0": "wait_s = 60.0\nwatchdog_s = 5.0",
+    "stiffness_nm_per_rad = 50.0": "stiffness_nm_per_rad = 0.5",
+    "hold_cycles = 2": "hold_cycles = 100",
+    "ramp_cycles = 10": "ramp_cycles = 1000\nstuck_rad = 0.0\nlate_cycles = 0",
+    'law = "half_sample"': 'law = "standard"',
+}
+
+#: A hand that leans on the wall, until the run ends by itself.
 UNTIL_STOPPED = {"rest_rad = 0.1": "rest_rad = -0.1", "duration_s = 4.2": ""}
 
 _SDO_REQUEST, _SDO_ANSWER, _STATUSWORD = 0x605, 0x585, b"\x40\x41\x60\x00\0\0\0\0"
@@ -65,6 +78,14 @@ def first_difference(one: Sequence[object], other: Sequence[object]) -> tuple[ob
     return None if len(one) == len(other) else (len(one), len(other))
 
 
+@contextlib.contextmanager
+def _fork_is_safe() -> Iterator[None]:
+    """Python 3.12 and newer warn of forking where libraries have threads. Theirs are idle."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        yield
+
+
 class Canwall:
     """`canwall ARGUMENTS` in a process of its own.
 
@@ -78,9 +99,7 @@ class Canwall:
         words = [str(word) for word in arguments]
         fork = multiprocessing.get_context("fork")
         self._process = fork.Process(target=_main, args=(words, self._out, self._err))
-        with warnings.catch_warnings():
-            # Python 3.12 and newer warn of forking where libraries have threads. Theirs are idle.
-            warnings.simplefilter("ignore", DeprecationWarning)
+        with _fork_is_safe():
             self._process.start()
 
     @property
@@ -104,9 +123,13 @@ class Canwall:
 
     def interrupt(self) -> int:
         """End it as Ctrl-C does."""
-        assert self._process.pid is not None
-        os.kill(self._process.pid, signal.SIGINT)
+        self.send(signal.SIGINT)
         return self.wait()
+
+    def send(self, number: signal.Signals) -> None:
+        """Send it a signal."""
+        assert self._process.pid is not None
+        os.kill(self._process.pid, number)
 
     def kill(self) -> None:
         self._process.kill()
@@ -120,14 +143,62 @@ def _main(words: list[str], out: Path, err: Path) -> None:
     sys.stdout = open(1, "w", buffering=1, closefd=False)  # noqa: SIM115 (until the process ends)
     sys.stderr = open(2, "w", buffering=1, closefd=False)  # noqa: SIM115
     sys.argv = ["canwall", *words]
-    cli.main()
+    with light():
+        cli.main()
+
+
+@contextlib.contextmanager
+def light() -> Iterator[None]:
+    """Runs of this process are not drawn, and the writer of their record is forked as well.
+
+    Neither has to do with the bus, and each takes an emulated processor ten seconds.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(canwall.run.running, "plot_run", lambda folder: None)
+        patch.setattr(canwall.record.recorder.subprocess, "Popen", _ForkedWriter)
+        yield
+
+
+class _ForkedWriter:
+    """What the record uses of a `subprocess.Popen` of its writer."""
+
+    def __init__(self, command: list[str], **_: object) -> None:
+        assert command[1:3] == ["-m", "canwall.record.writer"]
+        its_input, self._input = os.pipe()
+        self._output, its_output = os.pipe()
+        with _fork_is_safe():
+            self._pid = os.fork()
+        if self._pid == 0:
+            os.setsid()
+            os.dup2(its_input, 0)
+            os.dup2(its_output, 1)
+            for descriptor in (its_input, self._input, self._output, its_output):
+                os.close(descriptor)
+            sys.argv = command[2:]
+            sys.stdin, sys.stdout = open(0), open(1, "w")  # noqa: SIM115 (until the process ends)
+            try:
+                canwall.record.writer.main()
+            finally:
+                os._exit(0)
+        os.close(its_input)
+        os.close(its_output)
+
+    def communicate(self, timeout: float | None = None) -> tuple[bytes, None]:
+        os.close(self._input)
+        with open(self._output, "rb") as output:
+            said = output.read()
+        os.waitpid(self._pid, 0)
+        return said, None
+
+    def kill(self) -> None:
+        os.kill(self._pid, signal.SIGKILL)
 
 
 class Bench:
     """Programs on an interface, ended with the test."""
 
-    def __init__(self, folder: Path, interface: str = "vcan0") -> None:
-        self.folder, self.interface = folder, interface
+    def __init__(self, folder: Path, exchange: str, interface: str = "vcan0") -> None:
+        self.folder, self.exchange, self.interface = folder, exchange, interface
         self._stack = contextlib.ExitStack()
         self._started = 0
 
@@ -135,9 +206,10 @@ class Bench:
         self._stack.close()
 
     def config(self, changes: dict[str, str] | None = None) -> Path:
-        """config/vcan.toml with other text in places."""
+        """config/vcan.toml with the exchange of this bench, and other text in places."""
         self._started += 1
-        return config_file(self.folder / f"{self._started}.toml", changes, VCAN_CONFIG)
+        with_exchange = {"[drive]\n": f'exchange = "{self.exchange}"\n[drive]\n', **(changes or {})}
+        return config_file(self.folder / f"{self._started}.toml", with_exchange, VCAN_CONFIG)
 
     def canwall(self, *arguments: object) -> Canwall:
         self._started += 1

@@ -3,37 +3,79 @@
 import json
 import os
 import subprocess
+from collections.abc import Callable, Iterator
 
 import pytest
 from commands import Record, same_signals
 from conftest import Strikes
-from socketcan import Bench, first_difference, ip
+from socketcan import Bench, first_difference, ip, tc
 
 #: Set in the guest, whose controllers are emulated: a bench's own are not for tests.
 CONTROLLERS = os.environ.get("CANWALL_CONTROLLERS", "").split()
 
-
-@pytest.mark.skipif(
+pytestmark = pytest.mark.skipif(
     len(CONTROLLERS) < 2, reason="emulated controllers: scripts/vcan-guest has them"
 )
-def test_strike_through_two_controllers(strikes: Strikes, bench: Bench) -> None:
+
+
+@pytest.fixture(scope="module")
+def controllers() -> Iterator[tuple[str, str]]:
+    """The drive's and the master's, up at 1 Mbit/s."""
     for name in CONTROLLERS:
         ip("link", "set", name, "type", "can", "bitrate", 1_000_000)
-        ip("link", "set", name, "txqueuelen", 100)
         ip("link", "set", name, "up")
-    shown = subprocess.run(
-        ["ip", "-json", "-details", "link", "show", CONTROLLERS[0]], capture_output=True, check=True
-    )
-    (link,) = json.loads(shown.stdout)
-    assert link["linkinfo"]["info_data"]["bittiming"]["bitrate"] == 1_000_000
+    yield CONTROLLERS[0], CONTROLLERS[1]
+    for name in CONTROLLERS:
+        ip("link", "set", name, "down")
+
+
+def _strike(bench: Bench, controllers: tuple[str, str], duration_s: float) -> Record:
     of_the_drive, of_the_master = (
-        bench.config({'channel = "vcan0"': f'channel = "{name}"'}) for name in CONTROLLERS[:2]
+        bench.config({'channel = "vcan0"': f'channel = "{name}"'}) for name in controllers
     )
     bench.drive(of_the_drive)
     folder = bench.folder / "run"
-    run = bench.canwall("run", of_the_master, "--duration", 0.9, "--output", folder)
+    run = bench.canwall("run", of_the_master, "--duration", duration_s, "--output", folder)
     assert (run.wait(), run.errors) == (0, [])
-    record = Record(folder)
+    return Record(folder)
+
+
+def test_strike_through_two_controllers(
+    controllers: tuple[str, str],
+    strikes_by: Callable[[str], Strikes],
+    bench: Bench,
+) -> None:
+    for name in controllers:
+        shown = subprocess.run(
+            ["ip", "-json", "-details", "link", "show", name], capture_output=True, check=True
+        )
+        (link,) = json.loads(shown.stdout)
+        assert link["linkinfo"]["info_data"]["bittiming"]["bitrate"] == 1_000_000
+        assert "UP" in link["flags"]
+    record, on_vcan0 = _strike(bench, controllers, 0.9), strikes_by("native").record
     assert record.summary["missed_tpdo"] == 0
-    assert first_difference(record.cycles[:890], strikes.record.cycles[:890]) is None
-    assert same_signals(record, strikes.record, rows=890)
+    assert first_difference(record.cycles[:890], on_vcan0.cycles[:890]) is None
+    assert same_signals(record, on_vcan0, rows=890)
+
+
+def test_transmit_queue_that_is_full_for_a_moment(
+    controllers: tuple[str, str],
+    strikes_by: Callable[[str], Strikes],
+    bench: Bench,
+) -> None:
+    """Each SYNC comes upon the RPDO before it, which leaves after 5 ms: it is waited for."""
+    tc("qdisc", "add", "dev", controllers[1], "root", "netem", "delay", "5ms", "limit", "1")
+    try:
+        record = _strike(bench, controllers, 0.3)
+        queue = subprocess.run(
+            ["tc", "-json", "-statistics", "qdisc", "show", "dev", controllers[1]],
+            capture_output=True,
+            check=True,
+        )
+    finally:
+        tc("qdisc", "del", "dev", controllers[1], "root")
+    assert json.loads(queue.stdout)[0]["drops"] > 300, "the queue has been full"
+    on_vcan0 = strikes_by("native").record
+    assert record.column("torque_cmd_per_mille").any()
+    assert record.summary["missed_tpdo"] == 0
+    assert first_difference(record.cycles[:290], on_vcan0.cycles[:290]) is None

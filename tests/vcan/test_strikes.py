@@ -9,9 +9,12 @@ from rig import RPDO1, SDO_ANSWER, SYNC, TPDO1
 from socketcan import first_difference
 
 
-def test_signals_are_those_of_the_embedded_bus(strikes: Strikes, embedded: Record) -> None:
+def test_signals_are_those_of_the_embedded_bus(
+    strikes: Strikes, embedded: Record, exchange: str
+) -> None:
     """Bit by bit on the bus; what is computed beside, but for rounding on another processor."""
     ours, theirs = strikes.record.signals, embedded.signals
+    assert strikes.record.summary["timing"]["exchange"] == exchange
     assert ours.num_rows > 4200
     assert first_difference(strikes.record.cycles, embedded.cycles) is None
     assert ours.schema.equals(theirs.schema)
@@ -54,6 +57,6 @@ def test_load_and_foreign_sdo_pass_by(strikes: Strikes) -> None:
 def test_second_master_is_refused_before_it_sends(strikes: Strikes) -> None:
     assert strikes.second_master.wait() == 1
     (line,) = strikes.second_master.errors
-    assert line.startswith("canwall: another master is on the bus: it sends ")
+    assert line.startswith("canwall: another master is on vcan0: it sends ")
     assert line.endswith("; end it first")
     assert not strikes.folder_of_the_second.exists()
