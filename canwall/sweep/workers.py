@@ -10,6 +10,7 @@ from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from canwall.errors import InputError, RunFailedError
 from canwall.sweep.plan import Plan, compute
@@ -33,22 +34,32 @@ def computed(
     if plan.through == "bus":
         # Frames are the interpreter's work: only other processes have another one.
         context = multiprocessing.get_context("spawn")
-        return _in_a_pool(plan, pieces, ProcessPoolExecutor(count, context, _leave_signals))
+        return _in_a_pool(plan, pieces, ProcessPoolExecutor(count, context, _prepare_process))
     return _in_a_pool(plan, pieces, ThreadPoolExecutor(count))
 
 
-def _leave_signals() -> None:
-    """Ctrl-C is for the process that asked for the work."""
+def _prepare_process() -> None:
+    """Ctrl-C is for the process that asked for the work; its cores are for the pieces."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _one_core_each()
+
+
+def _one_core_each() -> threadpool_limits:
+    """BLAS without threads of its own until the context ends, which is not at all if none begins.
+
+    For matrices as small as a strike's they bring nothing, but wait awake on a core afterwards.
+    """
+    return threadpool_limits(1, user_api="blas")
 
 
 def _in_a_pool(plan: Plan, pieces: Sequence[int], pool: Executor) -> Iterator[Found]:
-    try:
-        jobs = {pool.submit(compute, plan, piece): piece for piece in pieces}
-        for job in as_completed(jobs):
-            yield jobs[job], job.result()
-    finally:
-        pool.shutdown(cancel_futures=True)
+    with _one_core_each():
+        try:
+            jobs = {pool.submit(compute, plan, piece): piece for piece in pieces}
+            for job in as_completed(jobs):
+                yield jobs[job], job.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def _on_a_cluster(plan: Plan, pieces: Sequence[int], address: str) -> Iterator[Found]:
