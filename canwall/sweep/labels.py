@@ -64,6 +64,10 @@ def circumstances(dataset: xr.Dataset) -> str:
         values = np.unique(dataset[name].values)
         if len(values) == 1:
             parts.append(text.format(values[0] * scale))
+    # An axis that the figure shows at one of its values.
+    for name in ("damping", "damping_normalised"):
+        if name in dataset.coords and name not in dataset.dims:
+            parts.append(_TITLES[name].format(f"{dataset[name].item():g}"))
     strikes = math.prod(dataset.sizes[name] for name in STRIKES)
     parts.append("1 strike" if strikes == 1 else f"the worst of {strikes} strikes")
     return ", ".join(parts)

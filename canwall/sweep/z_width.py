@@ -64,8 +64,8 @@ def draw_z_width(axes: Axes, dataset: xr.Dataset) -> None:
     for limit in _limits(dataset, low * y_unit, high * y_unit):
         x, y = limit.stiffness / x_unit, limit.damping / y_unit
         is_point = len(x) == 1
-        if is_point and not (left <= x[0] <= right and low <= y[0] <= high):
-            continue
+        if not np.any((left <= x) & (x <= right) & (low <= y) & (y <= high)):
+            continue  # what is beyond the map has no place in its legend either
         axes.add_line(
             Line2D(
                 x,
