@@ -1,5 +1,7 @@
 """The continuous referent of a run: the same hand on the same handle, against an ideal wall."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,19 +47,49 @@ class Referent:
 
     def positions(self, stiffness: Array, damping: Array, wall_position: Array) -> Array:
         """As `referent_positions`."""
-        origin = self._side * wall_position
-        # Measured from the wall, the hand's spring pulls from another place.
-        pull = self._side * self._constant - self._hand.stiffness_nm_per_rad * origin
         y = np.empty(len(stiffness))
-        y[0] = self._side * self._hand.rest_rad - origin[0]
-        wall = (stiffness, damping, origin)
-        joined = copied(self._joined)
-        if self._hand.grip:
-            _follow(joined, *wall, pull, self._slope, self._period, y)
-        else:
-            handle = copied(self._handle)
-            _follow_apart(handle, joined, self._body, *wall, pull, self._slope, self._period, y)
+        follow(self.following(wall_position), stiffness, damping, y)
         return y
+
+    def following(self, wall_position: Array) -> "Following":
+        """What `follow` needs, for a wall at these positions [rad] in each cycle; shape (n,)."""
+        origin = self._side * wall_position
+        return Following(
+            copied(self._handle),
+            copied(self._joined),
+            self._body,
+            self._hand.grip,
+            origin,
+            # Measured from the wall, the hand's spring pulls from another place.
+            self._side * self._constant - self._hand.stiffness_nm_per_rad * origin,
+            self._slope,
+            self._period,
+            self._side * self._hand.rest_rad,
+        )
+
+
+class Following(NamedTuple):
+    """Hand and handle as compiled code takes them; origin, pull and slope for each cycle, (n,)."""
+
+    handle: NDArray[np.void]
+    joined: NDArray[np.void]
+    body: Hand
+    grip: bool
+    origin: Array
+    pull: Array
+    slope: Array
+    period: float
+    rest: float
+
+
+@compiled
+def follow(of: Following, stiffness: Array, damping: Array, y: Array) -> None:
+    """Fill y, shape (n,), with the referent's positions relative to the wall, as at each SYNC."""
+    y[0] = of.rest - of.origin[0]
+    if of.grip:
+        _follow(of, stiffness, damping, y)
+    else:
+        _follow_apart(of, stiffness, damping, y)
 
 
 @compiled
@@ -69,47 +101,27 @@ def _meet(plant: Record, stiffness: float, damping: float, origin: float) -> Non
 
 
 @compiled
-def _follow(
-    plants: NDArray[np.void],
-    stiffness: Array,
-    damping: Array,
-    origin: Array,
-    constant: Array,
-    slope: Array,
-    period: float,
-    y: Array,
-) -> None:
+def _follow(of: Following, stiffness: Array, damping: Array, y: Array) -> None:
     """Fill y from its first value on, starting at rest."""
-    plant: Record = plants[0]
+    plant: Record = of.joined[0]
     v = 0.0
     for j in range(len(y) - 1):
-        _meet(plant, stiffness[j], damping[j], origin[j])
-        y_next, v, _ = advance(plant, y[j], v, constant[j], slope[j], period)
-        y[j + 1] = y_next + origin[j] - origin[j + 1]
+        _meet(plant, stiffness[j], damping[j], of.origin[j])
+        y_next, v, _ = advance(plant, y[j], v, of.pull[j], of.slope[j], of.period)
+        y[j + 1] = y_next + of.origin[j] - of.origin[j + 1]
 
 
 @compiled
-def _follow_apart(
-    handles: NDArray[np.void],
-    both: NDArray[np.void],
-    hand: Hand,
-    stiffness: Array,
-    damping: Array,
-    origin: Array,
-    constant: Array,
-    slope: Array,
-    period: float,
-    y: Array,
-) -> None:
+def _follow_apart(of: Following, stiffness: Array, damping: Array, y: Array) -> None:
     """Fill y from its first value on, starting at rest, with a hand that can lose the handle."""
-    handle: Record = handles[0]
-    joined: Record = both[0]
+    handle: Record = of.handle[0]
+    joined: Record = of.joined[0]
     now = Grasp(y[0], 0.0, y[0], 0.0, True)
     for j in range(len(y) - 1):
-        _meet(handle, stiffness[j], damping[j], origin[j])
-        _meet(joined, stiffness[j], damping[j], origin[j])
-        script = Force(constant[j], slope[j], 0.0, 0.0)
-        now = advance_grasp(handle, joined, hand, now, _NO_MOTOR, script, period)
-        shift = origin[j] - origin[j + 1]
+        _meet(handle, stiffness[j], damping[j], of.origin[j])
+        _meet(joined, stiffness[j], damping[j], of.origin[j])
+        script = Force(of.pull[j], of.slope[j], 0.0, 0.0)
+        now = advance_grasp(handle, joined, of.body, now, _NO_MOTOR, script, of.period)
+        shift = of.origin[j] - of.origin[j + 1]
         now = Grasp(now.y + shift, now.v, now.hand_y + shift, now.hand_v, now.touching)
         y[j + 1] = now.y

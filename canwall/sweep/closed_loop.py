@@ -7,6 +7,7 @@ the delay D from a sample to its torque. What it is not: frames, the drive's sta
 import functools
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,7 @@ from canwall.units import DriveUnits
 from canwall.walls import MAX_DELAY
 
 Array = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
 
 #: Where the cycle finds position, statusword and torque, and puts its torque.
 _TPDO = PdoLayout(
@@ -58,18 +60,26 @@ class Simulated:
     trip: Trip
 
 
-@dataclass(frozen=True)
-class Signals:
-    """One run while it rendered: each (n,), up to a trip if there is one (0: none).
+class Ready(NamedTuple):
+    """A closed loop as compiled code takes it, to be closed as often as wanted.
 
-    y: position relative to the wall. force: held from each SYNC on, out of the wall. torque: what
-    was commanded in each cycle [N·m].
+    The records of cycle and servo, the same memory as bytes, and their bytes at the beginning;
+    push and slope of the hand's force in each cycle; and what `ClosedLoop` knows.
     """
 
-    y: Array
-    force: Array
-    torque: Array
-    trip: int
+    cycle: NDArray[np.void]
+    servo: NDArray[np.void]
+    cycle_bytes: Bytes
+    servo_bytes: Bytes
+    cycle_before: Bytes
+    servo_before: Bytes
+    push: Array
+    slope: Array
+    nm_per_mille: float
+    whole: int
+    share: float
+    period: float
+    enabling: int
 
 
 def simulate(settings: Settings, cycles: int, enabling: int = ENABLING_CYCLES) -> Simulated:
@@ -80,9 +90,9 @@ def simulate(settings: Settings, cycles: int, enabling: int = ENABLING_CYCLES) -
     run has: changes of the wall, a person at the handle.
     """
     loop = ClosedLoop(settings, cycles, enabling)
-    rows = np.zeros(cycles, ROW)
-    cycle, done = loop.close(rows, np.empty((3, cycles)))
-    return Simulated(rows[:done], loop.units, Trip(int(cycle["trip"][0])))
+    ready, rows = loop.ready(), np.zeros(cycles, ROW)
+    done = close(ready, rows, np.empty((3, cycles)))
+    return Simulated(rows[:done], loop.units, Trip(int(ready.cycle["trip"][0])))
 
 
 class ClosedLoop:
@@ -120,21 +130,16 @@ class ClosedLoop:
         self._period = settings.bus.cycle_s
         self._enabling = enabling
 
-    def close(
-        self, rows: NDArray[np.void], signals: Array, wall: tuple[float, float] | None = None
-    ) -> tuple[NDArray[np.void], int]:
-        """Run from the beginning: the cycle as it is at the end, and how many cycles there were.
-
-        rows has dtype ROW and as many elements as are to be kept: cycle j goes into j modulo
-        their number. signals has shape (3, cycles): y, force, torque of `Signals`. wall: stiffness
-        and damping other than the configuration's.
-        """
-        cycle = copied(self._cycle)
-        if wall is not None:
-            _make_wall(cycle, *wall)
-        done = _close(
+    def ready(self) -> Ready:
+        """Records of its own for whoever closes it: several threads may."""
+        cycle, servo = copied(self._cycle), copied(self._servo)
+        return Ready(
             cycle,
-            copied(self._servo),
+            servo,
+            cycle.view(np.uint8),
+            servo.view(np.uint8),
+            self._cycle.view(np.uint8),
+            self._servo.view(np.uint8),
             self._push,
             self._slope,
             self._nm_per_mille,
@@ -142,17 +147,7 @@ class ClosedLoop:
             self._share,
             self._period,
             self._enabling,
-            rows,
-            signals,
         )
-        return cycle, done
-
-    def signals(self, stiffness: float, damping: float) -> Signals:
-        """What the configuration's hand does with a wall of that stiffness and damping."""
-        into = np.empty((3, len(self._push)))
-        cycle, done = self.close(np.zeros(1, ROW), into, (stiffness, damping))
-        y, force, torque = into[:, self._enabling : done]
-        return Signals(y, force, torque, int(cycle["trip"][0]))
 
 
 def loop_delay(settings: Settings) -> float:
@@ -197,38 +192,51 @@ def _scales(scaled: _Scaled) -> ServoScales:
 
 
 @compiled
-def _make_wall(cycles: NDArray[np.void], stiffness: float, damping: float) -> None:
-    """Write the wall to be rendered where `set_wall` writes it."""
-    cycle: Record = cycles[0]
+def close(loop: Ready, rows: NDArray[np.void], signals: Array) -> int:
+    """Run from the beginning on the configuration's wall; how many cycles there were.
+
+    rows has dtype ROW and as many elements as are to be kept: cycle j goes into j modulo their
+    number. signals has shape (3, cycles): position relative to the wall; force held from each SYNC
+    on, out of the wall; torque commanded. `loop.cycle` is left as it is at the end, with the trip.
+    """
+    _begin(loop)
+    return _close(loop, rows, signals)
+
+
+@compiled
+def close_on(
+    loop: Ready, stiffness: float, damping: float, rows: NDArray[np.void], signals: Array
+) -> int:
+    """`close` on a wall of another stiffness and damping."""
+    _begin(loop)
+    cycle: Record = loop.cycle[0]
+    # Where `set_wall` writes them.
     wall = cycle.rendered[0].wall[0]
     wall.stiffness = stiffness
     wall.damping = damping
     wall.referent[0].wall_stiffness = stiffness
     wall.referent[0].wall_damping = damping
+    return _close(loop, rows, signals)
 
 
 @compiled
-def _close(
-    cycles: NDArray[np.void],
-    servos: NDArray[np.void],
-    push: Array,
-    slope: Array,
-    nm_per_mille: float,
-    whole: int,
-    share: float,
-    period: float,
-    enabling: int,
-    rows: NDArray[np.void],
-    signals: Array,
-) -> int:
+def _begin(loop: Ready) -> None:
+    loop.cycle_bytes[:] = loop.cycle_before
+    loop.servo_bytes[:] = loop.servo_before
+
+
+@compiled
+def _close(loop: Ready, rows: NDArray[np.void], signals: Array) -> int:
     """Fill the signals; how many cycles. The torque of sample j acts from j + whole + share on."""
+    cycles, servos, push, slope = loop.cycle, loop.servo, loop.push, loop.slope
+    nm_per_mille, whole, share, period = loop.nm_per_mille, loop.whole, loop.share, loop.period
     cycle: Record = cycles[0]
     counts = encoder_counts(servos)
     # Torques on their way in per mille: sent[k] was computed k samples ago.
     sent = np.zeros(MAX_DELAY + 2, np.int64)
     at = 0
     for j in range(len(push)):
-        if j == enabling:
+        if j == loop.enabling:
             cycle.phase = _RENDERING
         # What the drive shows acts at the instant of the SYNC; one that is on its way does not.
         shown = sent[whole] if share > 0.0 or whole == 0 else sent[whole - 1]

@@ -176,10 +176,5 @@ def compute(plan: Plan, piece: int) -> NDArray[np.void]:
         (damping,) = plan.damping.values[walls]
         return k_limits(prepared, float(damping) * damping_unit)[:, None]
     stiffness_unit = mass / period**2 if plan.stiffness.name == "stiffness_normalised" else 1.0
-    chosen = plan.walls[walls]
-    found = np.zeros((1, len(chosen)), MEASURES)
-    for i, (damping, stiffness) in enumerate(chosen):
-        found[0, i] = prepared[0].on(
-            float(stiffness) * stiffness_unit, float(damping) * damping_unit
-        )
-    return found
+    chosen = [(float(k) * stiffness_unit, float(b) * damping_unit) for b, k in plan.walls[walls]]
+    return prepared[0].on_all(np.array(chosen))[None, :]

@@ -2,16 +2,18 @@
 
 import threading
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from canwall.compiled import Record, compiled
 from canwall.config import ConfigError, Hand, Mechanics, Settings
 from canwall.cycle import run_laws
-from canwall.record import Phase, Ring
-from canwall.referent import Referent
+from canwall.record import ROW, Phase, Ring
+from canwall.referent import Following, Referent, follow
 from canwall.run import drive_dictionary, make_axis, make_exchange, on_the_bus, render
-from canwall.sweep.closed_loop import ENABLING_CYCLES, ClosedLoop, Signals
+from canwall.sweep.closed_loop import ENABLING_CYCLES, ClosedLoop, Ready, close_on
 from canwall.sweep.measures import MEASURES, measure
 
 Array = NDArray[np.float64]
@@ -136,6 +138,19 @@ def struck(
     )
 
 
+class Judging(NamedTuple):
+    """What a strike is judged by: the run's limits, T, a count, a step of torque; SI units."""
+
+    orientation: float
+    wall_position: float
+    position_low: float
+    position_high: float
+    speed: float
+    period: float
+    encoder_count: float
+    torque_step: float
+
+
 class Strike:
     """One strike, prepared, to be rendered against one wall after another, and measured."""
 
@@ -145,9 +160,19 @@ class Strike:
         assert settings.simulation is not None
         self._settings = settings
         self._cycles = round(settings.run.duration_s / settings.bus.cycle_s)
-        self._loop = ClosedLoop(settings, self._cycles)
-        self._referent = Referent(settings, settings.simulation, self._cycles)
-        self._origin = np.full(self._cycles, settings.wall.position_rad)
+        loop = ClosedLoop(settings, self._cycles)
+        referent = Referent(settings, settings.simulation, self._cycles)
+        self._loop = loop.ready()
+        self._referent = referent.following(np.full(self._cycles, settings.wall.position_rad))
+        self._judging = Judging(
+            1.0 if settings.wall.side == "below" else -1.0,
+            settings.wall.position_rad,
+            *settings.limits.position_rad,
+            settings.limits.speed_rad_s,
+            settings.bus.cycle_s,
+            loop.units.rad_per_count,
+            loop.units.nm_per_mille,
+        )
         self._by_frames = through == "bus"
 
     @property
@@ -164,50 +189,103 @@ class Strike:
 
     def on(self, stiffness: float, damping: float) -> np.void:
         """The strike on a wall of that stiffness [N·m/rad] and damping [N·m·s/rad]; MEASURES."""
+        return self.on_all(np.array([[stiffness, damping]]))[0]
+
+    def on_all(self, walls: Array) -> NDArray[np.void]:
+        """`on` for walls of shape (n, 2), stiffness and damping; shape (n,), dtype MEASURES."""
+        found = np.zeros(len(walls), MEASURES)
         if self._by_frames:
-            wall = {"stiffness_nm_per_rad": stiffness, "damping_nm_s_per_rad": damping}
-            signals = signals_over_bus(
-                self._settings.model_copy(
-                    update={"wall": self._settings.wall.model_copy(update=wall)}
-                )
-            )
+            for i, (stiffness, damping) in enumerate(walls.tolist()):
+                found[i] = self._through_frames(stiffness, damping)
         else:
-            signals = self._loop.signals(stiffness, damping)
-        referent = self._referent.positions(
-            np.full(self._cycles, stiffness), np.full(self._cycles, damping), self._origin
+            # One call for all of them: between two, the threads of a sweep would wait in turns for
+            # the interpreter's lock.
+            _strike_all(self._loop, self._referent, self._judging, walls, np.zeros(1, ROW), found)
+        return found
+
+    def _through_frames(self, stiffness: float, damping: float) -> np.void:
+        wall = {"stiffness_nm_per_rad": stiffness, "damping_nm_s_per_rad": damping}
+        signals, trip = signals_over_bus(
+            self._settings.model_copy(update={"wall": self._settings.wall.model_copy(update=wall)})
         )
+        referent = np.empty(self._cycles)
+        each = np.full(self._cycles, stiffness), np.full(self._cycles, damping)
+        follow(self._referent, *each, referent)
         found = np.zeros(1, MEASURES)
-        measure(
-            signals.y,
-            signals.force,
-            signals.torque,
-            signals.trip,
-            signals.trip != 0 and not self._leaves(referent),
-            referent[ENABLING_CYCLES : ENABLING_CYCLES + len(signals.y)],
-            self.period,
-            self._loop.units.rad_per_count,
-            self._loop.units.nm_per_mille,
-            stiffness,
-            found,
-        )
+        _judge(self._judging, signals, trip, referent, ENABLING_CYCLES, stiffness, found)
         return found[0]
 
-    def _leaves(self, referent: Array) -> bool:
-        """Whether the referent itself passes the limits that end a run.
 
-        A soft wall gives way that far, and a stiff one gives back what was put into it.
-        """
-        wall, limits = self._settings.wall, self._settings.limits
-        sign = 1.0 if wall.side == "below" else -1.0
-        position = wall.position_rad + sign * referent
-        low, high = limits.position_rad
-        fastest = np.abs(np.diff(referent)).max(initial=0.0) / self.period
-        within = low <= position.min() and position.max() <= high and fastest <= limits.speed_rad_s
-        return not within
+@compiled
+def _strike_all(
+    loop: Ready,
+    hand: Following,
+    judging: Judging,
+    walls: Array,
+    rows: NDArray[np.void],
+    found: NDArray[np.void],
+) -> None:
+    """Strike and judge every wall; rows has dtype ROW, and is scratch."""
+    cycles = len(loop.push)
+    signals = np.empty((3, cycles))
+    stiffness, damping, referent = np.empty(cycles), np.empty(cycles), np.empty(cycles)
+    for i in range(len(walls)):
+        stiffness[:], damping[:] = walls[i, 0], walls[i, 1]
+        done = close_on(loop, walls[i, 0], walls[i, 1], rows, signals)
+        cycle: Record = loop.cycle[0]
+        follow(hand, stiffness, damping, referent)
+        rendered = signals[:, loop.enabling : done]
+        _judge(
+            judging, rendered, cycle.trip, referent, loop.enabling, walls[i, 0], found[i : i + 1]
+        )
 
 
-def signals_over_bus(settings: Settings) -> Signals:
-    """Render the wall of a strike through frames, on an embedded bus of its own."""
+@compiled
+def _judge(
+    judging: Judging,
+    signals: Array,
+    trip: int,
+    referent: Array,
+    enabling: int,
+    stiffness: float,
+    found: NDArray[np.void],
+) -> None:
+    """Into found, (1,): signals, (3, n), are those of `close`, from the end of enabling on."""
+    measure(
+        signals[0],
+        signals[1],
+        signals[2],
+        trip,
+        trip != 0 and not _leaves(judging, referent),
+        referent[enabling : enabling + signals.shape[1]],
+        judging.period,
+        judging.encoder_count,
+        judging.torque_step,
+        stiffness,
+        found,
+    )
+
+
+@compiled
+def _leaves(judging: Judging, referent: Array) -> bool:
+    """Whether the referent itself passes the limits that end a run.
+
+    A soft wall gives way that far, and a stiff one gives back what was put into it.
+    """
+    for j in range(len(referent)):
+        position = judging.wall_position + judging.orientation * referent[j]
+        if not judging.position_low <= position <= judging.position_high:
+            return True
+        if j and not abs(referent[j] - referent[j - 1]) / judging.period <= judging.speed:
+            return True
+    return False
+
+
+def signals_over_bus(settings: Settings) -> tuple[Array, int]:
+    """Render the wall of a strike through frames, on an embedded bus of its own.
+
+    Signals as those of `close`, shape (3, n), from the end of enabling on; and the trip.
+    """
     # A bus of its own: other threads of the process may strike at the same time.
     channel = f"{settings.bus.channel}-{threading.get_ident()}"
     bus = settings.bus.model_copy(update={"interface": "virtual", "channel": channel})
@@ -229,7 +307,5 @@ def signals_over_bus(settings: Settings) -> Signals:
         ring.close()
     rows = np.concatenate(pieces)
     rows = rows[rows["phase"] == Phase.RENDERING]
-    y, force, torque = (
-        np.ascontiguousarray(rows[name]) for name in ("y", "force_applied", "torque_cmd")
-    )
-    return Signals(y, force, torque, int(axis.cycle["trip"][0]))
+    signals = np.array([rows[name] for name in ("y", "force_applied", "torque_cmd")])
+    return signals, int(axis.cycle["trip"][0])

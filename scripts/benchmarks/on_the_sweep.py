@@ -11,8 +11,9 @@ import numpy as np
 from numba import njit
 
 from canwall import config
+from canwall.record import ROW
 from canwall.sweep import make_plan
-from canwall.sweep.closed_loop import ClosedLoop
+from canwall.sweep.closed_loop import ClosedLoop, close_on
 from canwall.sweep.plan import Plan
 from canwall.sweep.workers import computed
 
@@ -38,10 +39,11 @@ def closed_loop() -> dict[str, Any]:
     """Periods per second and core: plant with friction, encoder, estimator, law."""
     found = {}
     for law in ("standard", "half_sample", "mean_force", "push_only"):
-        one = ClosedLoop(_struck(law), _STRIKE)
-        one.signals(50.0, 0.0)
+        ready = ClosedLoop(_struck(law), _STRIKE).ready()
+        into = ready, 50.0, 0.0, np.zeros(1, ROW), np.empty((3, _STRIKE))
+        close_on(*into)
         found[law] = round(
-            100 * _STRIKE / _seconds(lambda one=one: [one.signals(50.0, 0.0) for _ in range(100)])  # type: ignore[misc]
+            100 * _STRIKE / _seconds(lambda into=into: [close_on(*into) for _ in range(100)])  # type: ignore[misc]
         )
     plain = _STRIKE / _seconds(_plain_strike, 3)
     return {
@@ -109,8 +111,8 @@ def sweep_on_two_cores() -> dict[str, Any]:
     plan = _plan(
         law="half_sample",
         stiffness="1:300:60",
-        damping="0:0.05:20",
-        speed=[0.5, 1.0],
+        damping="0:0.05:60",
+        speed=[0.5, 1.0, 2.0],
         phase=[0.0],
         press=1.1,
     )
