@@ -3,6 +3,7 @@
 import struct
 from collections.abc import Callable
 from contextlib import closing
+from copy import copy
 from pathlib import Path
 
 import can
@@ -20,12 +21,17 @@ from socketcan import (
 )
 
 _OF_THE_MASTER = (0x000, SYNC, RPDO1, SDO_REQUEST)
+#: canplayer waits for no answer: it is given so many times the time that the master took.
+_SLOWER = 4.0
 
 
 def _write_log(path: Path, frames: list[can.Message]) -> None:
+    begin = frames[0].timestamp
     with can.CanutilsLogWriter(path, channel="vcan0") as log:
         for frame in frames:
-            log.on_message_received(frame)
+            slowed = copy(frame)
+            slowed.timestamp = begin + _SLOWER * (frame.timestamp - begin)
+            log.on_message_received(slowed)
 
 
 def test_replayed_master_gets_the_recorded_answers(
