@@ -12,7 +12,7 @@ from rich.table import Table
 from canwall import config
 from canwall.cli import INTERRUPTED, guarded
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode="markdown")
 
 Config = Annotated[Path, typer.Argument(metavar="CONFIG", help="A TOML file.")]
 Output = Annotated[Path, typer.Option(metavar="DIR", help="Folder of the session.")]

@@ -63,6 +63,12 @@ class Say:
 # Usage
 
 
+def test_help_shows_units_and_keys(say: Say) -> None:
+    ball, change = say("ball", "--help").out, say("change", "--help").out
+    assert all(unit in ball for unit in ("[N/m]", "[kg]", "[m/s²]", "[s]"))
+    assert "[[schedule]]" in change
+
+
 def test_no_command_shows_the_help() -> None:
     done = command()
     for name in ("run", "drive", "plot"):

@@ -1,0 +1,125 @@
+"""Commands that examine a bench before anybody presses on a wall: `doctor`, `latency`."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from canwall.cli.ending import FAILED, StoppedError
+from canwall.cli.options import ConfigArgument, EdsOption, NoWatchdogOption, absolute, settings_from
+from canwall.cli.output import ShownProgress, console, errors, say
+
+if TYPE_CHECKING:
+    from canwall.bench import Findings
+
+
+def doctor(
+    config_file: Annotated[Path, typer.Argument(metavar="CONFIG", help="A TOML file.")],
+    eds: EdsOption = None,
+    accept_no_watchdog: NoWatchdogOption = False,
+) -> int:
+    """Find the drive, show how it would be set up and why, and test its watchdog.
+
+    The drive is enabled with zero torque for the test. What was changed is put back.
+    """
+    settings = settings_from(
+        config_file,
+        drive__eds=absolute(eds),
+        drive__accept_no_watchdog=accept_no_watchdog or None,
+    )
+    from canwall.bench import Findings, examine
+    from canwall.drive import REQUIRED_OBJECTS
+    from canwall.run import on_the_bus
+
+    def announce(what: str) -> None:
+        errors.print(f"doctor: {what}", markup=False)
+
+    findings = Findings()
+    try:
+        with on_the_bus(settings) as link:
+            examine(link, settings, REQUIRED_OBJECTS, announce, findings)
+    finally:
+        _show_findings(findings)
+    return 0 if findings.well else FAILED
+
+
+def latency(
+    config_file: ConfigArgument = None,
+    duration: Annotated[
+        float, typer.Option(min=0.1, help="Seconds of each part: idle, and under load.")
+    ] = 10.0,
+    load: Annotated[
+        int | None,
+        typer.Option(min=0, help="Processes that compute meanwhile; without: one per core."),
+    ] = None,
+    threads: Annotated[
+        int, typer.Option(min=0, help="Python threads of the same process that compute as well.")
+    ] = 0,
+    exchange: Annotated[
+        str | None, typer.Option(help="native, python-can or auto, instead of bus.exchange.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder for picture, histograms and numbers.")
+    ] = None,
+    eds: EdsOption = None,
+    accept_no_watchdog: NoWatchdogOption = False,
+) -> int:
+    """How well the cycle keeps to the clock on the bus of CONFIG, and what cycle is held.
+
+    SYNC, TPDO and RPDO go as in a run, idle and then under load, but the drive is not enabled and
+    gets zero torque. What was changed is put back.
+    """
+    settings = settings_from(
+        config_file,
+        bus__exchange=exchange,
+        drive__eds=absolute(eds),
+        drive__accept_no_watchdog=accept_no_watchdog or None,
+    )
+    from canwall.bench import measure_latency
+    from canwall.bench.latency_sheet import lines, write_latency
+    from canwall.run import stop_on_signals
+
+    processes = os.cpu_count() or 1 if load is None else load
+    with ShownProgress() as shown, stop_on_signals() as stop:
+        found = measure_latency(
+            settings, duration, processes, threads, stop, shown.report, shown.part
+        )
+    if found is None:
+        raise StoppedError("interrupted; the drive is as it was")
+    for line in lines(found):
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
+    if output is not None:
+        for path in write_latency(found, output):
+            console.print(str(path), soft_wrap=True, highlight=False)
+    for note in found.notes:
+        say(note)
+    console.print(found.verdict.text, soft_wrap=True, highlight=False, markup=False)
+    return 0
+
+
+def _show_findings(findings: "Findings") -> None:
+    """A table for people at a terminal, a line each for everybody else."""
+    if not console.is_terminal:
+        for line in findings.lines:
+            trouble = "" if line.well else "TROUBLE: "
+            console.print(
+                f"{line.section}: {line.what}: {trouble}{line.found}",
+                markup=False,
+                highlight=False,
+                soft_wrap=True,
+            )
+        return
+    table = Table(title="Doctor", title_justify="left")
+    for column in ("", "from", "found"):
+        table.add_column(column)
+    section = ""
+    for line in findings.lines:
+        style = "" if line.well else "bold red"
+        shown = "" if line.section == section else line.section
+        table.add_row(*(escape(text) for text in (shown, line.what, line.found)), style=style)
+        section = line.section
+    if findings.lines:
+        console.print(table)

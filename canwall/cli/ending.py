@@ -1,0 +1,38 @@
+"""How every command ends: exit codes, and errors as one line."""
+
+from collections.abc import Callable
+
+import typer
+from can import CanError
+
+from canwall.cli.output import say
+from canwall.errors import InputError, RunFailedError
+
+#: Exit codes: a run that failed or tripped, bad input, and Ctrl-C with the drive disabled.
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+
+
+class StoppedError(Exception):
+    """Ctrl-C, and what to say of it."""
+
+
+def guarded(command: Callable[[], object]) -> int:
+    """Every error as one line; a traceback is a bug."""
+    try:
+        result = command()
+    except StoppedError as interrupted:
+        say(str(interrupted))
+        return INTERRUPTED
+    except (KeyboardInterrupt, typer.Abort):
+        return INTERRUPTED
+    except typer.TyperException as error:
+        if text := error.format_message():  # none where the help was shown instead
+            say(text)
+        return BAD_INPUT
+    except InputError as error:
+        say(str(error))
+        return BAD_INPUT
+    except (RunFailedError, CanError) as error:
+        say(str(error))
+        return FAILED
+    return result if isinstance(result, int) else 0

@@ -1,0 +1,153 @@
+"""Commands that render walls: `run`, `change` meanwhile, and `drive`, the other end of the bus."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from canwall import config
+from canwall.cli.ending import FAILED, INTERRUPTED
+from canwall.cli.options import ConfigArgument, EdsOption, NoWatchdogOption, absolute, settings_from
+from canwall.cli.output import ShownProgress, console, say
+from canwall.config import ConfigError, Settings, absolute_law
+
+
+def run(
+    config_files: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="CONFIG",
+            help="TOML files, one for each drive on the bus; without: config/sim.toml.",
+        ),
+    ] = None,
+    law: Annotated[str | None, typer.Option(help="Law of the wall.")] = None,
+    stiffness: Annotated[float | None, typer.Option(help="Stiffness [N·m/rad].")] = None,
+    damping: Annotated[float | None, typer.Option(help="Damping [N·m·s/rad].")] = None,
+    duration: Annotated[float | None, typer.Option(help="Seconds; without: until Ctrl-C.")] = None,
+    output: Annotated[Path | None, typer.Option(help="Folder of the run's record.")] = None,
+    eds: EdsOption = None,
+    accept_no_watchdog: NoWatchdogOption = False,
+    restore: Annotated[
+        bool, typer.Option("--restore", help="Put back what the set-up changed in the drive.")
+    ] = False,
+) -> int:
+    """Render the wall: enable the drive, run, record, disable it again.
+
+    Several files: as many drives on one bus, each with its wall, on one SYNC. --law also ends the
+    changes of law that the file schedules.
+    """
+    files = config_files or [config.shipped("config/sim.toml")]
+    overrides = {
+        "wall__law": law and absolute_law(law, Path()),
+        "wall__stiffness_nm_per_rad": stiffness,
+        "wall__damping_nm_s_per_rad": damping,
+        "run__duration_s": duration,
+        "drive__eds": absolute(eds),
+        "drive__accept_no_watchdog": accept_no_watchdog or None,
+        "drive__restore": restore or None,
+    }
+    many = [_run_settings(path, overrides) for path in files]
+    from canwall.run import run_together  # numba takes a second to load: not for --help
+
+    with ShownProgress() as shown:
+        results = run_together(many, output, shown.report, shown.advance)
+    for result in results:
+        console.print(_strike_table(result.summary["strikes"]))
+        console.print(f"record: {result.folder.path}", soft_wrap=True, highlight=False)
+        for advice in result.summary["timing"]["advice"] if result is results[0] else ():
+            console.print(advice, soft_wrap=True, highlight=False, markup=False)
+        for remark in result.remarks:
+            say(remark)
+        for note in result.notes:
+            say(note)
+    outcome = results[0].outcome
+    for trip in outcome.trips:
+        say(trip)
+    if outcome.trips or any(result.notes for result in results):
+        return FAILED
+    return INTERRUPTED if outcome.interrupted else 0
+
+
+def _run_settings(path: Path, overrides: dict[str, Any]) -> Settings:
+    settings = settings_from(path, **overrides)
+    if overrides["wall__law"] is not None:
+        kept = tuple(change.model_copy(update={"law": None}) for change in settings.schedule)
+        settings = settings.model_copy(update={"schedule": kept})
+    return settings
+
+
+def change(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run that goes on.")],
+    assignments: Annotated[
+        list[str],
+        typer.Argument(metavar="KEY=VALUE", help="stiffness_nm_per_rad=80, limits.torque_nm=1"),
+    ],
+) -> int:
+    """Change the wall of a run while it is rendered; the keys are those of [[schedule]]."""
+    from canwall.live import change as post
+    from canwall.record import RunFolder
+
+    cycle = post(RunFolder(folder), assignments)
+    console.print(f"in force from cycle {cycle} on", highlight=False)
+    return 0
+
+
+def drive(
+    config_file: ConfigArgument = None,
+    real_time: Annotated[
+        bool, typer.Option("--real-time", help="Time as measured, not a period per SYNC.")
+    ] = False,
+    eds: EdsOption = None,
+) -> int:
+    """A simulated drive, alone on the bus of CONFIG, until stopped."""
+    settings = settings_from(config_file, drive__eds=absolute(eds))
+    if real_time and settings.simulation is not None:
+        simulation = settings.simulation.model_copy(update={"real_time": True})
+        settings = settings.model_copy(update={"simulation": simulation})
+    if settings.bus.interface == "virtual":
+        raise ConfigError(
+            "bus.interface = 'virtual' ends at this process, so nobody could reach the drive; "
+            "use 'unixcan' or 'socketcan' (see config/unixcan.toml)"
+        )
+    from canwall.run import serve_drive, stop_on_signals
+
+    def joined() -> None:
+        console.print(
+            f"simulated drive, node {settings.drive.node_id}, "
+            f"on {settings.bus.interface} {settings.bus.channel}; Ctrl-C ends it",
+            soft_wrap=True,
+            highlight=False,
+        )
+
+    def reported(fault: str) -> None:
+        console.print(fault, soft_wrap=True, highlight=False, markup=False)
+
+    with stop_on_signals() as stop:
+        serve_drive(settings, stop, joined, reported)
+    return 0
+
+
+def _strike_table(strikes: list[dict[str, Any]]) -> Table:
+    table = Table(title="Strikes", title_justify="left")
+    table.add_column("#", justify="right")
+    table.add_column("law", no_wrap=True)
+    table.add_column("K\n\\[N·m/rad]", justify="right")
+    table.add_column("contacts", justify="right")
+    table.add_column("deepest\n\\[mrad]", justify="right")
+    table.add_column("energy out\n\\[mJ]", justify="right")
+    table.add_column("chatter", no_wrap=True)
+    for number, strike in enumerate(strikes, start=1):
+        chatter = "no"
+        if strike["chatter"]:
+            chatter = f"yes, {strike['chatter_frequency_hz']:.0f} Hz"
+        table.add_row(
+            str(number),
+            strike["law"],
+            f"{strike['stiffness']:g}",
+            str(strike["contacts"]),
+            f"{strike['peak_penetration_rad'] * 1e3:.2f}",
+            f"{strike['energy_out_j'] * 1e3:z.2f}",
+            chatter,
+        )
+    return table

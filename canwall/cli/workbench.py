@@ -1,0 +1,92 @@
+"""Commands without a drive: `ball`, and `figures`, the chapter's, drawn anew."""
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from canwall.cli.output import ShownProgress, console
+from canwall.config import absolute_law
+from canwall.errors import InputError
+
+
+def ball(
+    law: Annotated[str, typer.Option(help="Law of the floor, or 'continuous' for its referent.")],
+    output: Annotated[Path, typer.Option(help="CSV file: t, y, v, f.")],
+    stiffness: Annotated[float, typer.Option(help="Floor's stiffness K [N/m].")] = 1.0,
+    damping: Annotated[float, typer.Option(help="Floor's damping B [N·s/m].")] = 0.0,
+    mass: Annotated[float, typer.Option(help="Ball's mass m [kg].")] = 1.0,
+    viscous: Annotated[float, typer.Option(help="Ball's viscous damping b [N·s/m].")] = 0.0,
+    spring: Annotated[float, typer.Option(help="Spring k_h on the ball [N/m].")] = 0.0,
+    gravity: Annotated[float, typer.Option(help="Gravity g [m/s²].")] = 1.0,
+    height: Annotated[float, typer.Option(help="Height at the start [m].")] = 1.0,
+    speed: Annotated[float, typer.Option(help="Velocity at the start [m/s].")] = 0.0,
+    period: Annotated[float, typer.Option(help="Sampling period T [s].")] = 0.1,
+    periods: Annotated[int, typer.Option(help="How many periods.")] = 3000,
+    deadbeat: Annotated[bool, typer.Option("--deadbeat", help="Add the compensation.")] = False,
+    tension: Annotated[str, typer.Option(help="allow, clamp or budget.")] = "allow",
+    passivity: Annotated[float, typer.Option(help="Passivity controller's damping.")] = 0.0,
+    option: Annotated[list[str] | None, typer.Option(help="Law's option, NAME=VALUE.")] = None,
+) -> int:
+    """A ball bouncing on a floor that is the wall: exact state, no delay, held force."""
+    from canwall.workbench import CONTINUOUS, Ball, bounced, write_ball
+
+    ball = Ball(
+        stiffness=stiffness,
+        damping=damping,
+        mass=mass,
+        viscous=viscous,
+        spring=spring,
+        gravity=gravity,
+        height=height,
+        speed=speed,
+        period=period,
+        periods=periods,
+        tension=tension,
+        passivity=passivity,
+    )
+    if law == CONTINUOUS and (deadbeat or option or tension != "allow" or passivity):
+        raise InputError(
+            "--law continuous is no law: it has no --deadbeat, --tension, --passivity, --option"
+        )
+    name = law if law == CONTINUOUS else absolute_law(law, Path())
+    y, v, force = bounced(ball, name, deadbeat, _named_numbers(option or []))
+    write_ball(output, ball, y, v, force)
+    energy = ball.energy(y, v)
+    outside = (y >= 0.0).nonzero()[0]
+    end = "never outside"
+    if len(outside):
+        last = int(outside[-1])
+        end = f"{energy[last]:.9g} at the last sample outside (t = {last * period:g})"
+    console.print(
+        f"θ = {ball.theta:g}; energy {energy[0]:.9g} at the start, {end}",
+        highlight=False,
+        soft_wrap=True,
+    )
+    return 0
+
+
+def _named_numbers(given: list[str]) -> dict[str, float]:
+    numbers = {}
+    for text in given:
+        name, equals, value = text.partition("=")
+        try:
+            numbers[name] = float(value)
+        except ValueError:
+            equals = ""
+        if not equals or not math.isfinite(numbers[name]):
+            raise InputError(f"--option {text}: has to be NAME=NUMBER")
+    return numbers
+
+
+def figures(
+    output: Annotated[Path, typer.Option(help="Folder for pictures, data and index.md.")],
+) -> int:
+    """The chapter's figures, drawn anew, each beside its data; and all laws compared."""
+    from canwall.workbench.figures import write_figures
+
+    with ShownProgress() as shown:
+        index = write_figures(output, progress=shown.count)
+    console.print(str(index), soft_wrap=True, highlight=False)
+    return 0
