@@ -1,12 +1,18 @@
 """What the tests share: rigs and programs that are ended with the test, and one recorded run."""
 
 import contextlib
+import signal
 import subprocess
 from collections.abc import Iterator
 
 import pytest
 from commands import Record, Start, command
 from rig import Rig, RigFactory
+
+# A shell without job control starts what it puts into the background with SIGINT ignored, and
+# canwall leaves it so: its tests are to mean the same there.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture
