@@ -112,7 +112,7 @@ CYCLE = np.dtype(
         ("started", "?"),
         ("innovation", "f8"),
         # Cycles since the position last changed, its last changes before [counts per cycle], and
-        # the motion that was missed in them.
+        # how much farther the handle should have gone that way in them [rad].
         ("frozen", "i8"),
         ("change", "i8"),
         ("change_before", "i8"),

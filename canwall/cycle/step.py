@@ -15,6 +15,7 @@ from canwall.units import to_per_mille
 from canwall.walls import (
     acting_force,
     actuation_state,
+    carry_on,
     commit,
     note_force,
     observe,
@@ -215,6 +216,8 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
         force = _wanted_force(cycle, received, due)
     per_mille = to_per_mille(cycle.orientation * force, cycle.nm_per_mille, cycle.torque_limit)
     torque = per_mille * cycle.nm_per_mille
+    if cycle.frozen and cycle.frozen < cycle.stuck_cycles:
+        carry_on(estimator, cycle.orientation * torque)
     commit(estimator, cycle.orientation * torque)
     cycle.force_applied = acting_force(estimator)
     if due:

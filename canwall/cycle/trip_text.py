@@ -38,7 +38,7 @@ def trip_text(axis: Axis, exchange: Exchange) -> str:
         case Trip.STUCK:
             what = (
                 f"the position has not changed for {int(cycle['frozen'])} cycles, in which the "
-                f"handle should have moved by {abs(float(cycle['motion_missed'])):.2g} rad "
+                f"handle should have moved by {float(cycle['motion_missed']):.2g} rad "
                 f"(limits.stuck_rad): look to the encoder"
             )
         case Trip.TORQUE:

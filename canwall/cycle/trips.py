@@ -5,6 +5,7 @@ from enum import IntEnum
 from canwall.compiled import Record, compiled
 from canwall.drive import State
 from canwall.record import Phase
+from canwall.walls import look_away
 
 
 class Trip(IntEnum):
@@ -69,8 +70,9 @@ def watch(cycle: Record) -> None:
 def _is_stuck(cycle: Record) -> bool:
     """Whether a handle that does not move any more was going on a moment ago.
 
-    Two witnesses have to agree: the model, which knows the torques, but may have the wrong mass;
-    and the last two changes of the position, carried on: a handle that was stopped slowed down.
+    Two witnesses have to agree, in direction as well: the model, which knows the torques, but may
+    have the wrong mass, and is not shown the position that stays, for it soon believes it; and the
+    last two changes of the position, carried on: a handle that was stopped slowed down.
     Three positions that are rounded to counts leave 3 counts open of the change to which they
     carry on, 2·(y[j] − y[j−1]) − (y[j−1] − y[j−2]); the least of it counts. What is slower than
     _LEAST_COUNTS may have come to a stop within a count, unseen.
@@ -80,7 +82,7 @@ def _is_stuck(cycle: Record) -> bool:
     if least < _LEAST_COUNTS:
         return False
     went = least * abs(cycle.rad_per_count) * cycle.stuck_cycles
-    return min(went, abs(cycle.motion_missed)) > cycle.stuck_limit
+    return min(went, cycle.motion_missed) > cycle.stuck_limit
 
 
 @compiled
@@ -102,8 +104,13 @@ def compare_position(cycle: Record, change: int, missed: int) -> None:
         cycle.motion_missed = 0.0
     else:
         cycle.frozen += 1
+        if cycle.frozen == 1:
+            look_away(cycle.estimator[0])
         if cycle.frozen <= cycle.stuck_cycles:
-            cycle.motion_missed -= cycle.innovation
+            ahead = cycle.estimator[0].unseen_y - cycle.oriented
+            if cycle.orientation * cycle.rad_per_count * cycle.change < 0.0:
+                ahead = -ahead
+            cycle.motion_missed = max(cycle.motion_missed, ahead)
     jumped = not abs(cycle.innovation) <= cycle.jump_limit * (1 + missed)
     if jumped and cycle.started and cycle.phase != _LEAVING and cycle.trip == 0:
         position = cycle.counts * cycle.rad_per_count

@@ -34,6 +34,10 @@ ESTIMATOR = np.dtype(
         ("full", _HOLD, (1,)),
         ("before", _HOLD, (1,)),
         ("after", _HOLD, (1,)),
+        # The state as it would be had the samples since `look_away` not been seen.
+        ("unseen_y", "f8"),
+        ("unseen_v", "f8"),
+        ("unseen_d", "f8"),
         # The last forces, newest first: committed[0] was computed one sample ago.
         ("committed", "f8", (MAX_DELAY + 1,)),
     ],
@@ -156,21 +160,40 @@ def actuation_state(estimator: Record) -> tuple[float, float]:
 
 
 @compiled
+def _over_period(
+    estimator: Record, y: float, v: float, d: float, force: float
+) -> tuple[float, float]:
+    """State at the next sample, by the forces on their way, of which `force` is the newest."""
+    n = estimator.delay_periods
+    y, v = _hold(estimator, estimator.before[0], y, v, estimator.committed[n] + d)
+    later = force if n == 0 else estimator.committed[n - 1]
+    return _hold(estimator, estimator.after[0], y, v, later + d)
+
+
+@compiled
 def commit(estimator: Record, force: float) -> None:
     """Take note of the force on its way, and bring the state to the next sample, x̂[j+1|j].
 
     `force` is what the drive will apply: after saturation and after rounding to its unit.
     """
-    n = estimator.delay_periods
-    committed = estimator.committed
-    y, v = _hold(
-        estimator, estimator.before[0], estimator.y, estimator.v, committed[n] + estimator.d
-    )
+    estimator.y, estimator.v = _over_period(estimator, estimator.y, estimator.v, estimator.d, force)
     for age in range(MAX_DELAY, 0, -1):
-        committed[age] = committed[age - 1]
-    committed[0] = force
-    estimator.y, estimator.v = _hold(
-        estimator, estimator.after[0], y, v, committed[n] + estimator.d
+        estimator.committed[age] = estimator.committed[age - 1]
+    estimator.committed[0] = force
+
+
+@compiled
+def look_away(estimator: Record) -> None:
+    """Keep the state before this sample and those that follow are observed."""
+    estimator.unseen_y, estimator.unseen_v = estimator.y, estimator.v
+    estimator.unseen_d = estimator.d
+
+
+@compiled
+def carry_on(estimator: Record, force: float) -> None:
+    """Bring the state of `look_away` to the next sample, by the forces alone; before `commit`."""
+    estimator.unseen_y, estimator.unseen_v = _over_period(
+        estimator, estimator.unseen_y, estimator.unseen_v, estimator.unseen_d, force
     )
 
 
