@@ -44,6 +44,9 @@ _INTERNAL_LIMIT = 1 << 11
 #: and 0.18 of its way per cycle. Below 5.5 counts per cycle the latter is less than one, unseen;
 #: the former, carried on, comes to 3.5.
 _LEAST_COUNTS = 4
+#: Torque [per mille of the rated one] with which a hand or friction may stop the handle without
+#: notice: at a hundred hertz that is done within a cycle, and the positions show no trace of it.
+_UNFORESEEN = 100.0
 
 
 @compiled
@@ -72,17 +75,19 @@ def _is_stuck(cycle: Record) -> bool:
 
     Two witnesses have to agree, in direction as well: the model, which knows the torques, but may
     have the wrong mass, and is not shown the position that stays, for it soon believes it; and the
-    last two changes of the position, carried on: a handle that was stopped slowed down.
+    last two changes of the position, carried on: a handle that was stopped slowed down, unless
+    _UNFORESEEN could do that within a cycle.
     Three positions that are rounded to counts leave 3 counts open of the change to which they
     carry on, 2·(y[j] − y[j−1]) − (y[j−1] − y[j−2]); the least of it counts. What is slower than
     _LEAST_COUNTS may have come to a stop within a count, unseen.
     """
     last, before = abs(cycle.change), abs(cycle.change_before)
-    least = min(last - 1, 2 * last - before - 3)
+    least = min(last - 1.0, 2.0 * last - before - 3.0)
     if least < _LEAST_COUNTS:
         return False
-    went = least * abs(cycle.rad_per_count) * cycle.stuck_cycles
-    return min(went, cycle.motion_missed) > cycle.stuck_limit
+    unforeseen = _UNFORESEEN * abs(cycle.nm_per_mille) / cycle.estimator[0].mass
+    went = least * abs(cycle.rad_per_count) - unforeseen * cycle.period**2
+    return min(went * cycle.stuck_cycles, cycle.motion_missed) > cycle.stuck_limit
 
 
 @compiled
