@@ -61,7 +61,7 @@ def sweep(
     }
     given |= {name: values for name, values in named.items() if values}
     settings = settings_from(config_file)
-    from canwall.sweep import make_plan, sweep_table
+    from canwall.sweep import make_plan, sweep_table, without_effect
     from canwall.sweep import sweep as swept
 
     with ShownProgress() as shown:
@@ -71,6 +71,8 @@ def sweep(
         except KeyboardInterrupt:
             raise StoppedError(f"interrupted; --resume goes on with {output}") from None
     console.print(sweep_table(dataset))
+    for line in without_effect(dataset):
+        console.print(line, soft_wrap=True, highlight=False)
     console.print(
         f"{plan.points_in_all} points: {output}; canwall plot {output} draws them",
         soft_wrap=True,

@@ -2,7 +2,7 @@
 
 from canwall.sweep.dataset import gathered
 from canwall.sweep.plan import Plan, make_plan
-from canwall.sweep.shown import sweep_table
+from canwall.sweep.shown import sweep_table, without_effect
 from canwall.sweep.strike import OPERATORS, Operator, Strike
 from canwall.sweep.sweeping import read_sweep, sweep
 
@@ -16,4 +16,5 @@ __all__ = [
     "read_sweep",
     "sweep",
     "sweep_table",
+    "without_effect",
 ]

@@ -28,14 +28,34 @@ def sweep_table(dataset: xr.Dataset) -> Table:
     return table
 
 
+def without_effect(dataset: xr.Dataset) -> list[str]:
+    """A line for stiffness or damping where the walls of some laws are the same at all its values.
+
+    A law without a damper takes any damping, and one without a spring any stiffness.
+    """
+    lines = []
+    for axis in (*STIFFNESS, *DAMPING):
+        if dataset.sizes.get(axis, 1) > 1:
+            rendered = dataset[["peak_torque", "penetration", "energy_out"]]
+            first = rendered.isel({axis: 0})
+            same = ((rendered == first) | (rendered.isnull() & first.isnull())).to_dataarray()
+            without = same.all([dim for dim in same.dims if dim != "law"])
+            laws = [str(law) for law in without["law"].values[without.values]]
+            if laws:
+                lines.append(f"{axis} changes nothing for {', '.join(laws)}")
+    return lines
+
+
 def _limits(dataset: xr.Dataset) -> Iterator[dict[str, str]]:
     worst = dataset["worst"]
     for shown, at in _conditions(dataset, [str(d) for d in worst.dims]):
         limit = worst.isel(at).item()
         best = dataset["limit"].isel(at).max().item()
+        # Where no strike chatters the search ends, not the wall.
+        least = "≥ " if dataset["open_ended"].isel(at).all().item() else ""
         yield shown | {
-            "K\n[N·m/rad]": f"{limit:.3g}",
-            "K·T²/m": f"{dataset['worst_normalised'].isel(at).item():.3g}",
+            "K\n[N·m/rad]": least + f"{limit:.3g}",
+            "K·T²/m": least + f"{dataset['worst_normalised'].isel(at).item():.3g}",
             "best strike\n÷ worst": f"{best / limit:.3g}" if limit > 0.0 else "–",
         }
 

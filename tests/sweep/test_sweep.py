@@ -14,7 +14,7 @@ from rig import settings_with
 
 from canwall import cli
 from canwall.errors import InputError
-from canwall.sweep import Plan, make_plan, read_sweep, sweep, sweep_table
+from canwall.sweep import Plan, make_plan, read_sweep, sweep, sweep_table, without_effect
 from canwall.sweep.journal import Journal
 from canwall.sweep.plan import compute
 from canwall.sweep.workers import computed
@@ -304,3 +304,15 @@ def test_a_map_is_shown_in_a_table() -> None:
     table = sweep_table(dataset)
     columns = [list(column.cells) for column in table.columns]
     assert columns == [["a", "b"], ["6", "6"], ["4", "1"], ["2", "none"], ["0", "0"]]
+
+
+@pytest.mark.parametrize("stiffness", [{}, {"stiffness": "2,20"}])
+def test_axis_that_a_law_has_no_use_for_is_told(tmp_path: Path, stiffness: dict[str, str]) -> None:
+    axes = {"law": ["standard", "damped", "rigid"], "damping": "0,0.02", "speed": "1", "phase": "0"}
+    dataset = sweep(make_plan(settings_with(), axes | stiffness), tmp_path / "a.nc")
+    of_stiffness = ["stiffness changes nothing for rigid"] if stiffness else []
+    assert without_effect(dataset) == [*of_stiffness, "damping changes nothing for standard, rigid"]
+    limits = list(sweep_table(dataset).columns[2].cells)
+    assert [cell.startswith("≥") for cell in limits] == [
+        not stiffness and n >= 4 for n in range(len(limits))
+    ]
