@@ -15,7 +15,8 @@ class Staircase:
     Steps are factors: 2 at first, the square root of it after each reversal. The first reversal
     with a factor of `finest` or less ends it: the limit lies between the last two walls. A person
     who errs once is brought back by the steps that follow. It ends as well at the ceiling, and
-    where even start/64 is not free. start, ceiling in N·m/rad. Raises InputError.
+    where nothing is free down to a 64th
+    of the start, or of the last wall that was. start, ceiling in N·m/rad. Raises InputError.
     """
 
     start: float
@@ -35,10 +36,13 @@ class Staircase:
         """Ask of one wall after the other."""
         stiffness, factor = self.start, 2.0
         free = is_free(stiffness)
-        while stiffness < self.ceiling if free else stiffness >= self.start / 64.0:
+        floor = stiffness / 64.0
+        while stiffness < self.ceiling if free else stiffness >= floor:
             before = free
             stiffness = min(stiffness * factor, self.ceiling) if free else stiffness / factor
             free = is_free(stiffness)
+            if free:
+                floor = stiffness / 64.0
             if free != before:
                 if factor <= self.finest:
                     return

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 from commands import PATIENCE_S, Record, torque_is_on, wait_for
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from rig import SIM_CONFIG
 
@@ -241,6 +241,7 @@ def test_a_folder_with_a_session_is_left_alone(folder: Path) -> None:
     assert (folder / "verdicts.csv").read_text() == "mine"
 
 
+@example(limit=0.5, start=46.0, ceiling=50.0, finest=1.25)
 @given(
     limit=st.floats(0.5, 1000.0),
     start=st.floats(1.0, 50.0),
