@@ -15,8 +15,8 @@ class Staircase:
     Steps are factors: 2 at first, the square root of it after each reversal. The first reversal
     with a factor of `finest` or less ends it: the limit lies between the last two walls. A person
     who errs once is brought back by the steps that follow. It ends as well at the ceiling, and
-    where nothing is free down to a 64th
-    of the start, or of the last wall that was. start, ceiling in N·m/rad. Raises InputError.
+    where nothing is free down to a 64th of the start, or of the last wall that was. start, ceiling
+    in N·m/rad. Raises InputError.
     """
 
     start: float
