@@ -216,13 +216,14 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
         force = _wanted_force(cycle, received, due)
     per_mille = to_per_mille(cycle.orientation * force, cycle.nm_per_mille, cycle.torque_limit)
     torque = per_mille * cycle.nm_per_mille
+    sent = cycle.orientation * torque
     if cycle.frozen and cycle.frozen < cycle.stuck_cycles:
-        carry_on(estimator, cycle.orientation * torque)
-    commit(estimator, cycle.orientation * torque)
+        carry_on(estimator, sent)
+    commit(estimator, sent)
     cycle.force_applied = acting_force(estimator)
     if due:
-        note_force(wall, cycle.orientation * torque)
-        note_force(cycle.faded[0].wall[0], cycle.orientation * torque)
+        note_force(wall, sent)
+        note_force(cycle.faded[0].wall[0], sent)
     cycle.torque_per_mille = per_mille
 
     row.j = cycle.j

@@ -78,7 +78,6 @@ class Ready(NamedTuple):
     nm_per_mille: float
     whole: int
     share: float
-    period: float
     enabling: int
 
 
@@ -127,7 +126,6 @@ class ClosedLoop:
         self._nm_per_mille = scales.rated_torque_mnm * _PER_MILLE_MILLI * scales.gear_ratio
         self._whole = math.floor(delay)
         self._share = delay - self._whole
-        self._period = settings.bus.cycle_s
         self._enabling = enabling
 
     def ready(self) -> Ready:
@@ -145,7 +143,6 @@ class ClosedLoop:
             self._nm_per_mille,
             self._whole,
             self._share,
-            self._period,
             self._enabling,
         )
 
@@ -229,9 +226,9 @@ def _begin(loop: Ready) -> None:
 def _close(loop: Ready, rows: NDArray[np.void], signals: Array) -> int:
     """Fill the signals; how many cycles. The torque of sample j acts from j + whole + share on."""
     cycles, servos, push, slope = loop.cycle, loop.servo, loop.push, loop.slope
-    nm_per_mille, whole, share, period = loop.nm_per_mille, loop.whole, loop.share, loop.period
+    nm_per_mille, whole, share = loop.nm_per_mille, loop.whole, loop.share
     cycle: Record = cycles[0]
-    counts = encoder_counts(servos)
+    period, counts = cycle.period, encoder_counts(servos)
     # Torques on their way in per mille: sent[k] was computed k samples ago.
     sent = np.zeros(MAX_DELAY + 2, np.int64)
     at = 0

@@ -2,7 +2,6 @@
 
 import threading
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -138,19 +137,6 @@ def struck(
     )
 
 
-class Judging(NamedTuple):
-    """What a strike is judged by: the run's limits, T, a count, a step of torque; SI units."""
-
-    orientation: float
-    wall_position: float
-    position_low: float
-    position_high: float
-    speed: float
-    period: float
-    encoder_count: float
-    torque_step: float
-
-
 class Strike:
     """One strike, prepared, to be rendered against one wall after another, and measured."""
 
@@ -160,19 +146,9 @@ class Strike:
         assert settings.simulation is not None
         self._settings = settings
         self._cycles = round(settings.run.duration_s / settings.bus.cycle_s)
-        loop = ClosedLoop(settings, self._cycles)
+        self._loop = ClosedLoop(settings, self._cycles).ready()
         referent = Referent(settings, settings.simulation, self._cycles)
-        self._loop = loop.ready()
         self._referent = referent.following(np.full(self._cycles, settings.wall.position_rad))
-        self._judging = Judging(
-            1.0 if settings.wall.side == "below" else -1.0,
-            settings.wall.position_rad,
-            *settings.limits.position_rad,
-            settings.limits.speed_rad_s,
-            settings.bus.cycle_s,
-            loop.units.rad_per_count,
-            loop.units.nm_per_mille,
-        )
         self._by_frames = through == "bus"
 
     @property
@@ -200,7 +176,7 @@ class Strike:
         else:
             # One call for all of them: between two, the threads of a sweep would wait in turns for
             # the interpreter's lock.
-            _strike_all(self._loop, self._referent, self._judging, walls, np.zeros(1, ROW), found)
+            _strike_all(self._loop, self._referent, walls, np.zeros(1, ROW), found)
         return found
 
     def _through_frames(self, stiffness: float, damping: float) -> np.void:
@@ -212,7 +188,7 @@ class Strike:
         each = np.full(self._cycles, stiffness), np.full(self._cycles, damping)
         follow(self._referent, *each, referent)
         found = np.zeros(1, MEASURES)
-        _judge(self._judging, signals, trip, referent, ENABLING_CYCLES, stiffness, found)
+        _judge(self._loop, signals, trip, referent, stiffness, found)
         return found[0]
 
 
@@ -220,7 +196,6 @@ class Strike:
 def _strike_all(
     loop: Ready,
     hand: Following,
-    judging: Judging,
     walls: Array,
     rows: NDArray[np.void],
     found: NDArray[np.void],
@@ -235,48 +210,46 @@ def _strike_all(
         cycle: Record = loop.cycle[0]
         follow(hand, stiffness, damping, referent)
         rendered = signals[:, loop.enabling : done]
-        _judge(
-            judging, rendered, cycle.trip, referent, loop.enabling, walls[i, 0], found[i : i + 1]
-        )
+        _judge(loop, rendered, cycle.trip, referent, walls[i, 0], found[i : i + 1])
 
 
 @compiled
 def _judge(
-    judging: Judging,
+    loop: Ready,
     signals: Array,
     trip: int,
     referent: Array,
-    enabling: int,
     stiffness: float,
     found: NDArray[np.void],
 ) -> None:
     """Into found, (1,): signals, (3, n), are those of `close`, from the end of enabling on."""
+    cycle: Record = loop.cycle[0]
     measure(
         signals[0],
         signals[1],
         signals[2],
         trip,
-        trip != 0 and not _leaves(judging, referent),
-        referent[enabling : enabling + signals.shape[1]],
-        judging.period,
-        judging.encoder_count,
-        judging.torque_step,
+        trip != 0 and not _leaves(cycle, referent),
+        referent[loop.enabling : loop.enabling + signals.shape[1]],
+        cycle.period,
+        cycle.rad_per_count,
+        cycle.nm_per_mille,
         stiffness,
         found,
     )
 
 
 @compiled
-def _leaves(judging: Judging, referent: Array) -> bool:
+def _leaves(cycle: Record, referent: Array) -> bool:
     """Whether the referent itself passes the limits that end a run.
 
     A soft wall gives way that far, and a stiff one gives back what was put into it.
     """
     for j in range(len(referent)):
-        position = judging.wall_position + judging.orientation * referent[j]
-        if not judging.position_low <= position <= judging.position_high:
+        position = cycle.rendered[0].position + cycle.orientation * referent[j]
+        if not cycle.position_low <= position <= cycle.position_high:
             return True
-        if j and not abs(referent[j] - referent[j - 1]) / judging.period <= judging.speed:
+        if j and not abs(referent[j] - referent[j - 1]) / cycle.period <= cycle.speed_limit:
             return True
     return False
 
