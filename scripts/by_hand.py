@@ -1,6 +1,5 @@
 """Sweeps on a drive with a person at the handle: `scripts/staircase`, `scripts/alternating`."""
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
@@ -10,9 +9,9 @@ from rich.console import Console
 from rich.table import Table
 
 from canwall import config
-from canwall.cli import INTERRUPTED, guarded
+from canwall.cli import INTERRUPTED, make_program, run_program
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode="markdown")
+app = make_program()
 
 Config = Annotated[Path, typer.Argument(metavar="CONFIG", help="A TOML file.")]
 Output = Annotated[Path, typer.Option(metavar="DIR", help="Folder of the session.")]
@@ -104,4 +103,4 @@ def _session(
 
 
 if __name__ == "__main__":
-    sys.exit(guarded(lambda: app(standalone_mode=False)))
+    run_program(app)

@@ -1,24 +1,18 @@
 """The commands, thin: options in, one call, tables and error lines out.
 
-A module for each group of commands; what they share is in `options`, `output` and `ending`.
+A module for each group of commands; what they share is in `options`, `output`, `ending`, `program`.
 """
 
-import sys
 from typing import NoReturn
-
-import typer
 
 from canwall.cli import bench, run, sweep, workbench
 from canwall.cli.ending import INTERRUPTED, guarded
+from canwall.cli.program import make_program, run_program
 
-__all__ = ["INTERRUPTED", "app", "guarded", "main"]
+__all__ = ["INTERRUPTED", "app", "guarded", "main", "make_program", "run_program"]
 
-app = typer.Typer(
-    add_completion=False,
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="markdown",  # in rich markup the units [m] would be tags
-    help="A stiff virtual wall without chatter on a CANopen servo drive.",
+app = make_program(
+    no_args_is_help=True, help="A stiff virtual wall without chatter on a CANopen servo drive."
 )
 for command in (
     run.run,
@@ -36,4 +30,4 @@ for command in (
 
 def main() -> NoReturn:
     """Entry point of the command `canwall`; ends the process with the exit code."""
-    sys.exit(guarded(lambda: app(standalone_mode=False)))
+    run_program(app)
