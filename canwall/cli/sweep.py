@@ -10,7 +10,7 @@ from canwall.cli.ending import StoppedError
 from canwall.cli.options import settings_from
 from canwall.cli.output import ShownProgress, console
 from canwall.config import absolute_law
-from canwall.errors import InputError
+from canwall.errors import InputError, RunFailedError
 
 
 def sweep(
@@ -70,6 +70,8 @@ def sweep(
             dataset = swept(plan, output, resume, workers, dask, partial(shown.count, "sweeping"))
         except KeyboardInterrupt:
             raise StoppedError(f"interrupted; --resume goes on with {output}") from None
+        except RunFailedError as error:
+            raise RunFailedError(f"{error}; --resume goes on with {output}") from None
     console.print(sweep_table(dataset))
     for line in without_effect(dataset):
         console.print(line, soft_wrap=True, highlight=False)

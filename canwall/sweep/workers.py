@@ -6,13 +6,20 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures import (
+    CancelledError,
+    Executor,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    as_completed,
+)
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from canwall.errors import InputError, RunFailedError
+from canwall.sweep.dataset import versions
 from canwall.sweep.plan import Plan, compute
 
 Found = tuple[int, NDArray[np.void]]
@@ -67,8 +74,11 @@ def _on_a_cluster(plan: Plan, pieces: Sequence[int], address: str) -> Iterator[F
         import distributed
     except ImportError:
         raise InputError("--dask needs dask.distributed: install canwall[dask]") from None
-    # What it has to say comes as an exception too.
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    # What they have to say comes as an exception too, or has been put right, as where a worker died
+    # with a result. Some have levels of their own.
+    for name in list(logging.root.manager.loggerDict):
+        if name.partition(".")[0] == "distributed":
+            logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         # A client that cannot read its address, or meets somebody else there, hangs.
         distributed.comm.get_address_host_port(address, strict=True)
@@ -82,16 +92,34 @@ def _on_a_cluster(plan: Plan, pieces: Sequence[int], address: str) -> Iterator[F
         raise InputError(f"--dask {address}: no scheduler there: {reason}") from None
     with client:
         jobs = {
-            client.submit(compute, plan, piece, pure=False, retries=2): piece for piece in pieces
+            client.submit(_compute_there, versions(), plan, piece, pure=False, retries=2): piece
+            for piece in pieces
         }
         try:
             for job in distributed.as_completed(list(jobs), loop=client.loop):
                 yield jobs[job], job.result()
                 job.release()
+        except CancelledError:
+            raise RunFailedError(f"--dask {address}: the scheduler is gone") from None
         except distributed.KilledWorker as error:
             raise RunFailedError(f"--dask {address}: {error}") from None
+        except (ImportError, RuntimeError) as error:
+            # The scheduler that cannot import what the pieces are made of says RuntimeError.
+            raise RunFailedError(
+                f"--dask {address}: scheduler and workers need the canwall that is here: "
+                f"{error.__cause__ or error}"
+            ) from None
         finally:
             client.cancel(list(jobs))
+
+
+def _compute_there(here: dict[str, str], plan: Plan, piece: int) -> NDArray[np.void]:
+    """Compute a piece on a worker. Raises RunFailedError where it would make other numbers."""
+    if (there := versions()) != here:
+        other = [f"{name} {there[name]}" for name in here if there[name] != here[name]]
+        needed = [f"{name} {here[name]}" for name in here if there[name] != here[name]]
+        raise RunFailedError(f"a worker has {', '.join(other)}; needed: {', '.join(needed)}")
+    return compute(plan, piece)
 
 
 async def _greet(address: str) -> None:

@@ -3,8 +3,9 @@
 import os
 import signal
 import subprocess
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -33,11 +34,13 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Cluster:
     """A scheduler and two workers, processes of their own on this machine."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, first: Path | None = None) -> None:
+        """first: where its processes look for packages before they look anywhere else."""
         self.workers: list[subprocess.Popen[bytes]] = []
+        self._environment = os.environ | ({"PYTHONPATH": str(first)} if first else {})
         self._log = (folder / "log").open("wb")
         file = folder / "scheduler.json"
-        self._scheduler = self._start(
+        self.scheduler = self._start(
             "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
             "--scheduler-file", str(file),
         )  # fmt: skip
@@ -59,6 +62,7 @@ class Cluster:
             [str(Path(COMMAND).with_name("dask")), *arguments],
             stdout=self._log,
             stderr=self._log,
+            env=self._environment,
         )
 
     @property
@@ -68,19 +72,30 @@ class Cluster:
         return str(json.loads(self.scheduler_file.read_text())["address"])
 
     def close(self) -> None:
-        for process in (*self.workers, self._scheduler):
+        for process in (*self.workers, self.scheduler):
             process.kill()
             process.wait()
         self._log.close()
 
 
 @pytest.fixture
-def cluster(tmp_path: Path) -> Iterator[Cluster]:
-    folder = tmp_path / "cluster"
-    folder.mkdir()
-    started = Cluster(folder)
-    yield started
-    started.close()
+def clusters(tmp_path: Path) -> Iterator[Callable[..., Cluster]]:
+    running: list[Cluster] = []
+
+    def start(first: Path | None = None) -> Cluster:
+        folder = tmp_path / f"cluster{len(running)}"
+        folder.mkdir()
+        running.append(Cluster(folder, first))
+        return running[-1]
+
+    yield start
+    for cluster in running:
+        cluster.close()
+
+
+@pytest.fixture
+def cluster(clusters: Callable[..., Cluster]) -> Cluster:
+    return clusters()
 
 
 def wait_for_pieces(output: Path, process: "subprocess.Popen[str]") -> None:
@@ -120,6 +135,70 @@ def test_a_worker_that_is_killed_loses_nothing_but_time(
     assert (process.returncode, errors) == (0, "")
     assert cluster.workers[0].poll() == -signal.SIGKILL
     assert read_sweep(output).identical(read_sweep(whole))
+
+
+def test_worker_that_dies_with_results_is_no_word_on_the_terminal(cluster: Cluster) -> None:
+    """The client warns if it asks for one just then, which cannot be timed: any warning here."""
+    code = f"""
+import logging
+from pathlib import Path
+from canwall.config import load
+from canwall.sweep import make_plan
+from canwall.sweep.workers import computed
+plan = make_plan(load(Path({str(SIM_CONFIG)!r})), {{"stiffness": "1,2"}})
+pieces = range(plan.pieces)
+assert len(list(computed(plan, pieces, dask={cluster.address!r}))) == plan.pieces
+for name in list(logging.root.manager.loggerDict):
+    if name.startswith("distributed"):
+        logging.getLogger(name).warning("this one")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_lost_scheduler_ends_the_sweep_and_resume_goes_on(
+    cluster: Cluster, whole: Path, tmp_path: Path
+) -> None:
+    output = tmp_path / "clustered.nc"
+    process = started(*SWEEP, "--output", output, "--dask", cluster.address)
+    wait_for_pieces(output, process)
+    cluster.scheduler.kill()
+    _, errors = process.communicate(timeout=PATIENCE_S)
+    line = f"--dask {cluster.address}: the scheduler is gone; --resume goes on with {output}"
+    assert (process.returncode, errors) == (1, f"canwall: {line}\n")
+    done = command(*SWEEP, "--output", output, "--resume")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert read_sweep(output).identical(read_sweep(whole))
+
+
+def another_version(folder: Path) -> None:
+    info = folder / "canwall-0.0.1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: canwall\nVersion: 0.0.1\n")
+
+
+def none_at_all(folder: Path) -> None:
+    (folder / "canwall.py").write_text("raise ImportError('this machine has no canwall')\n")
+
+
+@pytest.mark.parametrize(
+    ("made", "line"),
+    [
+        (another_version, "a worker has canwall 0.0.1; needed: canwall "),
+        (none_at_all, "need the canwall that is here: this machine has no canwall"),
+    ],
+)
+def test_cluster_with_other_software_computes_nothing(
+    made: Callable[[Path], None], line: str, clusters: Callable[..., Cluster], tmp_path: Path
+) -> None:
+    packages, output = tmp_path / "packages", tmp_path / "a.nc"
+    packages.mkdir()
+    made(packages)
+    done = command(*SWEEP, "--output", output, "--dask", clusters(packages).address)
+    assert done.returncode == 1
+    assert line in done.stderr
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+    assert not list(tmp_path.glob("a.nc*"))
 
 
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
