@@ -90,27 +90,26 @@ def _on_a_cluster(plan: Plan, pieces: Sequence[int], address: str) -> Iterator[F
             error = ValueError("what is there is none")
         reason = str(error).splitlines()[0] if str(error) else "no answer"
         raise InputError(f"--dask {address}: no scheduler there: {reason}") from None
-    with client:
-        jobs = {
-            client.submit(_compute_there, versions(), plan, piece, pure=False, retries=2): piece
-            for piece in pieces
-        }
-        try:
+    try:
+        # What is still to be done when the client leaves, nobody wants any more: it is dropped.
+        with client:
+            jobs = {
+                client.submit(_compute_there, versions(), plan, piece, pure=False, retries=2): piece
+                for piece in pieces
+            }
             for job in distributed.as_completed(list(jobs), loop=client.loop):
                 yield jobs[job], job.result()
                 job.release()
-        except CancelledError:
-            raise RunFailedError(f"--dask {address}: the scheduler is gone") from None
-        except distributed.KilledWorker as error:
-            raise RunFailedError(f"--dask {address}: {error}") from None
-        except (ImportError, RuntimeError) as error:
-            # The scheduler that cannot import what the pieces are made of says RuntimeError.
-            raise RunFailedError(
-                f"--dask {address}: scheduler and workers need the canwall that is here: "
-                f"{error.__cause__ or error}"
-            ) from None
-        finally:
-            client.cancel(list(jobs))
+    except (CancelledError, distributed.comm.CommClosedError):
+        raise RunFailedError(f"--dask {address}: the scheduler is gone") from None
+    except distributed.KilledWorker as error:
+        raise RunFailedError(f"--dask {address}: {error}") from None
+    except (ImportError, RuntimeError) as error:
+        # The scheduler that cannot import what the pieces are made of says RuntimeError.
+        raise RunFailedError(
+            f"--dask {address}: scheduler and workers need the canwall that is here: "
+            f"{error.__cause__ or error}"
+        ) from None
 
 
 def _compute_there(here: dict[str, str], plan: Plan, piece: int) -> NDArray[np.void]:
