@@ -336,7 +336,7 @@ def test_others_may_ask_the_drive_while_it_runs_in_real_time(
     # A machine that has other things to do is not to be why the run ends: TPDOs may be missing for
     # long, and the torque that is held meanwhile throws no handle.
     changes = {
-        "cycle_s = 0.001": 'cycle_s = 0.001\npace = "real_time"',
+        "cycle_s = 0.001": 'cycle_s = 0.004\npace = "real_time"',
         "hold_cycles = 2": "hold_cycles = 100",
         "ramp_cycles = 10": "ramp_cycles = 1000",
         "stiffness_nm_per_rad = 50.0": "stiffness_nm_per_rad = 2.0",

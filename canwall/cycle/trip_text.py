@@ -81,9 +81,12 @@ def _too_short(axis: Axis) -> str:
 def _pause(axis: Axis, exchange: Exchange) -> str:
     """Why a drive has left where it was its master that was not there."""
     watchdog, pause_s = axis.setup.watchdog, exchange.longest_pause_s()
-    if pause_s <= watchdog.time_s:
+    # The latest sign of life may have been a period old when the pause began.
+    before_s = watchdog.period_s if watchdog.beat else 0.0
+    if pause_s + before_s <= watchdog.time_s:
         return ""
+    every = f" for a frame every {before_s * 1e3:.0f} ms" if watchdog.beat else ""
     return (
         f"; the master had stood still for {pause_s:.3g} s, the drive's watchdog "
-        f"({watchdog.kind}) waits for {watchdog.time_s * 1e3:g} ms"
+        f"({watchdog.kind}) waits {watchdog.time_s * 1e3:g} ms{every}"
     )
