@@ -27,6 +27,8 @@ from canwall.sweep.limit import LIMITED, k_limits
 from canwall.sweep.measures import MEASURES
 from canwall.sweep.strike import Strike
 
+#: A piece of work and what was found, as `compute` returns it.
+Found = tuple[int, NDArray[np.void]]
 #: Points of a map that are one piece of work: its strike is prepared once.
 _PIECE = 120
 #: The largest result: 1.5 GB.
