@@ -1,5 +1,6 @@
 """The result of a sweep as one xarray Dataset, from which every figure can be drawn again."""
 
+import functools
 import importlib.metadata
 import json
 import platform
@@ -36,6 +37,7 @@ _CIRCUMSTANCES = {
 _PACKAGES = ("canwall", "numpy", "scipy", "numba", "xarray")
 
 
+@functools.cache
 def versions() -> dict[str, str]:
     """Of what has made the numbers."""
     found = {name: importlib.metadata.version(name) for name in _PACKAGES}
