@@ -4,6 +4,7 @@ import asyncio
 import logging
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,17 +32,7 @@ def on_a_cluster(plan: Plan, pieces: Sequence[int], address: str) -> Iterator[Fo
     for name in list(logging.root.manager.loggerDict):
         if name.partition(".")[0] == "distributed":
             logging.getLogger(name).setLevel(logging.CRITICAL)
-    try:
-        # A client that cannot read its address, or meets somebody else there, hangs.
-        distributed.comm.get_address_host_port(address, strict=True)
-        asyncio.run(asyncio.wait_for(_greet(address), _THERE_S))
-        client = distributed.Client(address, timeout=_PATIENCE_S, set_as_default=False)
-    except (OSError, ValueError, TimeoutError, MemoryError) as error:
-        # Who speaks another protocol is taken to announce more than there is memory.
-        if isinstance(error, MemoryError):
-            error = ValueError("what is there is none")
-        reason = str(error).splitlines()[0] if str(error) else "no answer"
-        raise InputError(f"--dask {address}: no scheduler there: {reason}") from None
+    client = _connected(address)
     try:
         # What is still to be done when the client leaves, nobody wants any more: it is dropped.
         with client:
@@ -67,10 +58,27 @@ def on_a_cluster(plan: Plan, pieces: Sequence[int], address: str) -> Iterator[Fo
 def _compute_there(here: dict[str, str], plan: Plan, piece: int) -> NDArray[np.void]:
     """Compute a piece on a worker. Raises RunFailedError where it would make other numbers."""
     if (there := versions()) != here:
-        other = [f"{name} {there[name]}" for name in here if there[name] != here[name]]
-        needed = [f"{name} {here[name]}" for name in here if there[name] != here[name]]
-        raise RunFailedError(f"a worker has {', '.join(other)}; needed: {', '.join(needed)}")
+        wrong = [name for name in here if there[name] != here[name]]
+        other, needed = (", ".join(f"{n} {found[n]}" for n in wrong) for found in (there, here))
+        raise RunFailedError(f"a worker has {other}; needed: {needed}")
     return compute(plan, piece)
+
+
+def _connected(address: str) -> Any:
+    """A distributed.Client of the scheduler there. Raises InputError where there is none."""
+    import distributed
+
+    try:
+        # A client that cannot read its address, or meets somebody else there, hangs.
+        distributed.comm.get_address_host_port(address, strict=True)
+        asyncio.run(asyncio.wait_for(_greet(address), _THERE_S))
+        return distributed.Client(address, timeout=_PATIENCE_S, set_as_default=False)
+    except (OSError, ValueError, TimeoutError, MemoryError) as error:
+        # Who speaks another protocol is taken to announce more than there is memory.
+        if isinstance(error, MemoryError):
+            error = ValueError("what is there is none")
+        reason = str(error).splitlines()[0] if str(error) else "no answer"
+        raise InputError(f"--dask {address}: no scheduler there: {reason}") from None
 
 
 async def _greet(address: str) -> None:
