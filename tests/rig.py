@@ -163,6 +163,16 @@ class Rig:
         ]
 
 
+def lack(rig: Rig, *missing: int) -> None:
+    """Take objects out of the drive's dictionary or, for 0x1400, the event timers of its RPDOs."""
+    for index in missing:
+        if index == 0x1400:
+            for communication in range(0x1400, 0x1404):
+                del rig.node.dictionary[communication].subindices[5]
+        else:
+            del rig.node.dictionary[index]
+
+
 class Loop:
     """What `canwall run` builds around a drive that is set up, on a rig, without a writer."""
 

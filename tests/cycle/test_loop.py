@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from can.interfaces.virtual import VirtualBus
 from numpy.typing import NDArray
-from rig import RPDO1, SDO_REQUEST, SYNC, TPDO1, Loop, Rig, RigFactory, settings_with
+from rig import RPDO1, SDO_REQUEST, SYNC, TPDO1, Loop, Rig, RigFactory, lack, settings_with
 
 from canwall.config import Settings
 from canwall.cycle import Change, Outcome
@@ -105,10 +105,9 @@ def test_torque_is_applied_by_the_sync_after_the_rpdo(make_rig: RigFactory) -> N
 def test_drive_that_is_disabled_does_not_miss_its_master(make_rig: RigFactory, kind: str) -> None:
     rig = make_rig(pressing())
     if kind != "RPDO event timer":
-        for index in range(0x1400, 0x1404):
-            del rig.node.dictionary[index].subindices[5]
+        lack(rig, 0x1400)
     if kind == "life guarding":
-        del rig.node.dictionary[0x1016]
+        lack(rig, 0x1016)
     for _ in range(2):  # and a second run is as good as the first
         loop = Loop(rig)
         assert loop.setup.watchdog.kind == kind

@@ -1,7 +1,7 @@
 """What a trip says of a master that was not there."""
 
 import pytest
-from rig import Loop, RigFactory, settings_with
+from rig import Loop, RigFactory, lack, settings_with
 
 from canwall.cycle.trip_text import trip_text
 from canwall.cycle.trips import Trip
@@ -25,9 +25,7 @@ def test_pause_that_the_watchdog_may_have_met(
 ) -> None:
     rig = make_rig(settings_with())
     if kind == "life guarding":
-        del rig.node.dictionary[0x1016]
-        for index in range(0x1400, 0x1404):
-            del rig.node.dictionary[index].subindices[5]
+        lack(rig, 0x1400, 0x1016)
     loop = Loop(rig)
     assert loop.setup.watchdog.kind == kind
     loop.record["trip"] = Trip.REPORTED

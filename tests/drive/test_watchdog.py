@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from rig import Rig, RigFactory, settings_with
+from rig import Rig, RigFactory, lack, settings_with
 
 from canwall.drive import Beat, DriveError
 
@@ -14,12 +14,7 @@ REAL_TIME = {"bus.pace": "real_time", "drive.wait_s": 0.0}
 def rig_without(make_rig: RigFactory, *missing: int, **drive: object) -> Rig:
     """A drive in real time; its dictionary lacks some objects, or (0x1400) the RPDO's timer."""
     rig = make_rig(settings_with(REAL_TIME | {f"drive.{k}": v for k, v in drive.items()}))
-    for index in missing:
-        if index == 0x1400:
-            for communication in range(0x1400, 0x1404):
-                del rig.node.dictionary[communication].subindices[5]
-        else:
-            del rig.node.dictionary[index]
+    lack(rig, *missing)
     return rig
 
 

@@ -118,18 +118,29 @@ def wait_for_pieces(output: Path, process: "subprocess.Popen[str]") -> None:
     raise AssertionError("no pieces came")
 
 
-def started(*arguments: object) -> "subprocess.Popen[str]":
-    return subprocess.Popen(
-        [COMMAND, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+def begun(output: Path, *options: object) -> "subprocess.Popen[str]":
+    """SWEEP, some of its pieces done."""
+    process = subprocess.Popen(
+        [COMMAND, *map(str, (*SWEEP, "--output", output, *options))],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
+    wait_for_pieces(output, process)
+    return process
+
+
+def assert_resume_goes_on(output: Path, whole: Path) -> None:
+    done = command(*SWEEP, "--output", output, "--resume", "--workers", 2)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert read_sweep(output).identical(read_sweep(whole))
 
 
 def test_a_worker_that_is_killed_loses_nothing_but_time(
     cluster: Cluster, whole: Path, tmp_path: Path
 ) -> None:
     output = tmp_path / "clustered.nc"
-    process = started(*SWEEP, "--output", output, "--dask", cluster.address)
-    wait_for_pieces(output, process)
+    process = begun(output, "--dask", cluster.address)
     cluster.workers[0].kill()
     _, errors = process.communicate(timeout=PATIENCE_S)
     assert (process.returncode, errors) == (0, "")
@@ -160,15 +171,12 @@ def test_lost_scheduler_ends_the_sweep_and_resume_goes_on(
     cluster: Cluster, whole: Path, tmp_path: Path
 ) -> None:
     output = tmp_path / "clustered.nc"
-    process = started(*SWEEP, "--output", output, "--dask", cluster.address)
-    wait_for_pieces(output, process)
+    process = begun(output, "--dask", cluster.address)
     cluster.scheduler.kill()
     _, errors = process.communicate(timeout=PATIENCE_S)
     line = f"--dask {cluster.address}: the scheduler is gone; --resume goes on with {output}"
     assert (process.returncode, errors) == (1, f"canwall: {line}\n")
-    done = command(*SWEEP, "--output", output, "--resume")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert read_sweep(output).identical(read_sweep(whole))
+    assert_resume_goes_on(output, whole)
 
 
 def another_version(folder: Path) -> None:
@@ -204,8 +212,7 @@ def test_cluster_with_other_software_computes_nothing(
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
 def test_what_was_interrupted_goes_on(whole: Path, tmp_path: Path, end: signal.Signals) -> None:
     output = tmp_path / "a.nc"
-    process = started(*SWEEP, "--output", output, "--workers", 1)
-    wait_for_pieces(output, process)
+    process = begun(output, "--workers", 1)
     os.kill(process.pid, end)
     _, errors = process.communicate(timeout=PATIENCE_S)
     if end == signal.SIGINT:
@@ -213,7 +220,5 @@ def test_what_was_interrupted_goes_on(whole: Path, tmp_path: Path, end: signal.S
         assert errors == f"canwall: interrupted; --resume goes on with {output}\n"
     assert not output.exists()
     assert command(*SWEEP, "--output", output).returncode == 2
-    done = command(*SWEEP, "--output", output, "--resume", "--workers", 2)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert read_sweep(output).identical(read_sweep(whole))
+    assert_resume_goes_on(output, whole)
     assert [path.name for path in tmp_path.iterdir()] == ["a.nc"]
