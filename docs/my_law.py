@@ -18,7 +18,7 @@ OPTIONS = {"growth": 5.0}
 
 
 def my_law(wall: Any) -> float:
-    """f = K·depth·(1 + growth·depth) − B·ẏ, with the depth in the middle of the coming period."""
+    """F = K·depth·(1 + growth·depth) − B·ẏ, with the depth in the middle of the coming period."""
     if wall.y >= 0.0:
         return 0.0
     growth = wall.options[0]

@@ -35,7 +35,7 @@ def staircase(
 
     Each wall is a run with a folder of its own in DIR; verdicts.csv has what the person said.
     """
-    from canwall.sweep.staircase import Staircase, staircases
+    from canwall.study.staircase import Staircase, staircases
 
     steps = Staircase(start, ceiling, finest)
     return _session(
@@ -58,8 +58,8 @@ def alternating(
     The person is not told which strike had which law. Each wall is a run with a folder of its own
     in DIR; verdicts.csv has what the person said.
     """
+    from canwall.study.staircase import alternating
     from canwall.sweep.axes import parsed
-    from canwall.sweep.staircase import alternating
 
     walls = [float(value) for value in parsed("stiffness", stiffness).values]
     return _session(
@@ -75,9 +75,9 @@ def _session(
     ask: Callable[..., None],
 ) -> int:
     from canwall.config import absolute_law
-    from canwall.sweep.by_hand import Session
-    from canwall.sweep.staircase import limits
-    from canwall.sweep.terminal import SessionEndedError, Terminal
+    from canwall.study.session import Session
+    from canwall.study.staircase import limits
+    from canwall.study.terminal import SessionEndedError, Terminal
 
     settings = config.load(config_file)
     laws = [absolute_law(name, Path()) for name in laws]

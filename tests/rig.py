@@ -12,23 +12,23 @@ from can.interfaces.virtual import VirtualBus
 from numpy.typing import NDArray
 
 from canwall import config, simdrive
+from canwall.bus import socket_pair
 from canwall.config import Settings
 from canwall.cycle import (
-    Axis,
-    Change,
     Exchange,
     ExternalSync,
     NativeExchange,
     Outcome,
     PythonCanExchange,
+    WallAxis,
+    WallStage,
     run_laws,
     run_loop,
 )
 from canwall.drive import REQUIRED_OBJECTS, DriveNode, DriveSetup, Link, set_up
 from canwall.eds import load_eds
-from canwall.pair import pair
 from canwall.record import Ring
-from canwall.run import make_watch
+from canwall.run import make_monitor
 
 SIM_CONFIG = config.shipped("config/sim.toml")
 SYNC, TPDO1, RPDO1, SDO_REQUEST, SDO_ANSWER = 0x080, 0x185, 0x205, 0x605, 0x585
@@ -123,7 +123,7 @@ class Rig:
         self.bus: can.BusABC
         self.drive_bus: can.BusABC
         if native:
-            self.bus, self.drive_bus = pair(channel)
+            self.bus, self.drive_bus = socket_pair(channel)
         else:
             self.bus, self.drive_bus = bus(channel), VirtualBus(channel)
         self.tampering = Tampering(
@@ -181,10 +181,10 @@ class Loop:
         self.laws = run_laws(rig.settings)
         self.setup = rig.set_up()
         self.ring = Ring.create()
-        self.axis = Axis(rig.node, self.setup, rig.settings, self.laws, self.ring)
+        self.axis = WallAxis(rig.node, self.setup, rig.settings, self.laws, self.ring)
         self.record = self.axis.cycle
         self.exchange = self.make_exchange(real_time)
-        self.watch = make_watch(rig.link, [self.axis])
+        self.monitor = make_monitor(rig.link, [self.axis])
 
     def make_exchange(self, real_time: bool = False, external_sync: bool = False) -> Exchange:
         """The exchange that the rig is for, with its own SYNC or somebody else's."""
@@ -198,7 +198,7 @@ class Loop:
         self,
         cycles: int | None,
         stop: Callable[[int], bool] = lambda j: False,
-        changes: list[Change] | None = None,
+        changes: list[WallStage] | None = None,
         progress: Callable[[int], None] = lambda j: None,
     ) -> Outcome:
         """`stop` is asked once a cycle, with the cycle: a place to do things as well."""

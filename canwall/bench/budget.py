@@ -20,7 +20,7 @@ def frame_bits(length: int, stuffed: bool = True) -> int:
 
 
 @dataclass(frozen=True)
-class CyclicFrame:
+class BudgetFrame:
     """A frame that comes once per cycle."""
 
     name: str
@@ -29,14 +29,14 @@ class CyclicFrame:
 
 
 @dataclass(frozen=True)
-class Line:
+class BudgetLine:
     """One frame of the budget.
 
     earliest_s, latest_s: its end after the beginning of the SYNC, the bus being free of all else
     but one frame of the greatest length, that had begun before [s].
     """
 
-    frame: CyclicFrame
+    frame: BudgetFrame
     bits: int
     share: float
     earliest_s: float
@@ -47,7 +47,7 @@ class Line:
 class Budget:
     """What a cycle takes."""
 
-    lines: tuple[Line, ...]
+    lines: tuple[BudgetLine, ...]
     bits: int
     share: float
     highest_hz: float
@@ -59,9 +59,9 @@ class Budget:
 
 
 def bus_budget(
-    sync: CyclicFrame,
-    tpdos: Sequence[CyclicFrame],
-    rpdos: Sequence[CyclicFrame],
+    sync: BudgetFrame,
+    tpdos: Sequence[BudgetFrame],
+    rpdos: Sequence[BudgetFrame],
     bitrate: int,
     cycle_s: float,
 ) -> Budget:
@@ -79,11 +79,11 @@ def bus_budget(
         bits = frame_bits(frame.length)
         worst += bits
         share = bits / bitrate / cycle_s
-        lines.append(Line(frame, bits, share, best / bitrate, blocking + worst / bitrate))
+        lines.append(BudgetLine(frame, bits, share, best / bitrate, blocking + worst / bitrate))
     highest = USABLE * bitrate / worst
     # Rounded down: a rate that is said to fit, fits.
     return Budget(tuple(lines), worst, worst / bitrate / cycle_s, math.floor(highest))
 
 
-def _by_priority(frames: Sequence[CyclicFrame]) -> list[CyclicFrame]:
+def _by_priority(frames: Sequence[BudgetFrame]) -> list[BudgetFrame]:
     return sorted(frames, key=lambda frame: frame.can_id)

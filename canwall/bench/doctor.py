@@ -9,11 +9,11 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from canwall.bench.budget import USABLE, CyclicFrame, bus_budget
+from canwall.bench.budget import USABLE, BudgetFrame, bus_budget
 from canwall.config import Settings
 from canwall.drive import DriveError, DriveNode, DriveSetup, Link, PdoLayout, set_up
 from canwall.drive import objects as od
-from canwall.drive.cia402 import State, state_of, status_text
+from canwall.drive.cia402 import DriveState, state_of, status_text
 from canwall.drive.pdo import tpdos_on_sync
 from canwall.drive.trial import Trial
 from canwall.eds import load_eds
@@ -117,9 +117,9 @@ def _describe_budget(
     """All that the drive sends with a SYNC, whether the wall needs it or not."""
     bus, counted = settings.bus, 1 if setup.sync_counter_overflow else 0
     budget = bus_budget(
-        CyclicFrame("SYNC", setup.sync_cob_id, counted),
-        [CyclicFrame("TPDO", tpdo.cob_id, tpdo.length) for tpdo in tpdos_on_sync(node)],
-        [CyclicFrame("RPDO", setup.rpdo.cob_id, setup.rpdo.length)],
+        BudgetFrame("SYNC", setup.sync_cob_id, counted),
+        [BudgetFrame("TPDO", tpdo.cob_id, tpdo.length) for tpdo in tpdos_on_sync(node)],
+        [BudgetFrame("RPDO", setup.rpdo.cob_id, setup.rpdo.length)],
         bus.bitrate,
         bus.cycle_s,
     )
@@ -180,7 +180,7 @@ def _fall_silent(
     alive_until = time.monotonic() + max(_ALIVE_S, 2.0 * watchdog.time_s)
     while time.monotonic() < alive_until:
         statusword = trial.cycle(0x0F)
-        if statusword is not None and state_of(statusword) is not State.OPERATION_ENABLED:
+        if statusword is not None and state_of(statusword) is not DriveState.OPERATION_ENABLED:
             raise RunFailedError(
                 f"node {node.node_id} went to {status_text(statusword)} while its master was "
                 f"alive: drive.watchdog_s = {watchdog.time_s:g} may be too short for this machine"
@@ -190,7 +190,7 @@ def _fall_silent(
     while True:
         statusword = node.read(od.STATUSWORD)
         seen = time.monotonic()
-        if state_of(statusword) is not State.OPERATION_ENABLED:
+        if state_of(statusword) is not DriveState.OPERATION_ENABLED:
             break
         if seen >= give_up:
             findings.add(

@@ -17,12 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from canwall.bench.budget import USABLE, Budget, CyclicFrame, bus_budget
+from canwall.bench.budget import USABLE, Budget, BudgetFrame, bus_budget
 from canwall.config import Settings
 from canwall.cycle import (
-    Axis,
     Exchange,
     Grant,
+    WallAxis,
     buckets_ns,
     percentile_ns,
     real_time_machine,
@@ -68,7 +68,7 @@ class Histogram:
 
 
 @dataclass(frozen=True)
-class Phase:
+class LatencyPart:
     """One part of the measurement.
 
     sync_error: |interval of the SYNC − period|. tpdo_to_rpdo: from the TPDO's arrival, by the
@@ -87,7 +87,7 @@ class Phase:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class ShortestCycle:
     """What the machine, the interface and the bus hold together.
 
     holds_s: shortest cycle [s], math.inf where none was seen to be held; by_bus_s, by_machine_s:
@@ -111,9 +111,9 @@ class Latency:
     exchange: str
     granted: dict[str, Grant]
     load: str
-    phases: tuple[Phase, ...]
+    phases: tuple[LatencyPart, ...]
     budget: Budget
-    verdict: Verdict
+    shortest_cycle: ShortestCycle
     notes: tuple[str, ...]
 
 
@@ -176,7 +176,7 @@ def measure_latency(
         _described(processes, threads),
         tuple(phases),
         budget,
-        verdict(phases, budget, settings, granted),
+        shortest_cycle(phases, budget, settings, granted),
         tuple(notes),
     )
 
@@ -186,7 +186,7 @@ class _Cycling:
 
     def __init__(
         self,
-        axis: Axis,
+        axis: WallAxis,
         exchange: Exchange,
         stop: Callable[[], bool],
         progress: Callable[[str, float, float], None],
@@ -195,7 +195,7 @@ class _Cycling:
         self._stop, self._progress = stop, progress
         self._period_s = axis.settings.bus.cycle_s
 
-    def phase(self, name: str, duration_s: float) -> Phase:
+    def phase(self, name: str, duration_s: float) -> LatencyPart:
         """So many seconds of cycles. Raises RunFailedError where no TPDO comes at all."""
         axis, exchange = self._axis, self._exchange
         self._run(name, _SETTLING_S, told=False)
@@ -211,7 +211,7 @@ class _Cycling:
             histogram[:] = np.zeros(1, histogram.dtype)
         first = int(axis.cycle["j"][0])
         self._run(name, duration_s, told=True)
-        return Phase(
+        return LatencyPart(
             name,
             int(axis.cycle["j"][0]) - first,
             int(axis.cycle["missed_tpdo"][0]) - missed_before,
@@ -272,21 +272,21 @@ def _described(processes: int, threads: int) -> str:
     return " and ".join(parts) or "none"
 
 
-def _budget(axis: Axis, settings: Settings) -> Budget:
+def _budget(axis: WallAxis, settings: Settings) -> Budget:
     """Of all that the drive sends with a SYNC, and of the cycle's own frames."""
     setup, bus = axis.setup, settings.bus
     return bus_budget(
-        CyclicFrame("SYNC", setup.sync_cob_id, 1 if setup.sync_counter_overflow else 0),
-        [CyclicFrame("TPDO", tpdo.cob_id, tpdo.length) for tpdo in tpdos_on_sync(axis.node)],
-        [CyclicFrame("RPDO", setup.rpdo.cob_id, setup.rpdo.length)],
+        BudgetFrame("SYNC", setup.sync_cob_id, 1 if setup.sync_counter_overflow else 0),
+        [BudgetFrame("TPDO", tpdo.cob_id, tpdo.length) for tpdo in tpdos_on_sync(axis.node)],
+        [BudgetFrame("RPDO", setup.rpdo.cob_id, setup.rpdo.length)],
         bus.bitrate,
         bus.cycle_s,
     )
 
 
-def verdict(
-    phases: Sequence[Phase], budget: Budget, settings: Settings, granted: dict[str, Grant]
-) -> Verdict:
+def shortest_cycle(
+    phases: Sequence[LatencyPart], budget: Budget, settings: Settings, granted: dict[str, Grant]
+) -> ShortestCycle:
     """The shortest cycle that is held: one RPDO of a thousand may come after the next SYNC.
 
     By the machine: the p99.9 of SYNC to RPDO, and the time that frames take on the wire after that;
@@ -304,7 +304,7 @@ def verdict(
             f"not even bus.cycle_s = {bus.cycle_s:g} is held: {share:.2%} of the TPDOs do not come "
             f"within 80 % of the cycle ({_when(missing)})"
         )
-        return Verdict(math.inf, by_bus_s, math.inf, text)
+        return ShortestCycle(math.inf, by_bus_s, math.inf, text)
     holds_s = math.ceil(max(by_bus_s, by_machine_s) * 1e5) / 1e5
     if by_bus_s >= by_machine_s:
         why = (
@@ -320,7 +320,7 @@ def verdict(
             f"bus alone would hold {by_bus_s * 1e6:.0f} µs"
         )
     held = "holds" if holds_s <= bus.cycle_s else f"does not hold {bus.cycle_s * 1e3:g} ms, but"
-    return Verdict(
+    return ShortestCycle(
         holds_s,
         by_bus_s,
         by_machine_s,
@@ -333,11 +333,11 @@ def _without_bit_rate(settings: Settings) -> bool:
     return bus.interface in _WITHOUT_BIT_RATE or bus.channel.startswith("vcan")
 
 
-def _when(phase: Phase) -> str:
+def _when(phase: LatencyPart) -> str:
     return "under load" if phase.name == "load" else phase.name
 
 
-def _largest_part(phase: Phase) -> str:
+def _largest_part(phase: LatencyPart) -> str:
     """Which part of the way from SYNC to RPDO is the longest, by its p99.9."""
     late, own = phase.sync_error.p999_us, phase.tpdo_to_rpdo.p999_us
     parts = {

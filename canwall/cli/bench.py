@@ -79,7 +79,7 @@ def latency(
         drive__accept_no_watchdog=accept_no_watchdog or None,
     )
     from canwall.bench import measure_latency
-    from canwall.bench.latency_sheet import lines, write_latency
+    from canwall.bench.latency_report import lines, write_latency
     from canwall.run import stop_on_signals
 
     processes = os.cpu_count() or 1 if load is None else load
@@ -96,7 +96,7 @@ def latency(
             console.print(str(path), soft_wrap=True, highlight=False)
     for note in found.notes:
         say(note)
-    console.print(found.verdict.text, soft_wrap=True, highlight=False, markup=False)
+    console.print(found.shortest_cycle.text, soft_wrap=True, highlight=False, markup=False)
     return 0
 
 

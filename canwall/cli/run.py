@@ -85,8 +85,8 @@ def change(
     ],
 ) -> int:
     """Change the wall of a run while it is rendered; the keys are those of [[schedule]]."""
-    from canwall.live import change as post
     from canwall.record import RunFolder
+    from canwall.run.changes import change as post
 
     cycle = post(RunFolder(folder), assignments)
     console.print(f"in force from cycle {cycle} on", highlight=False)

@@ -96,8 +96,8 @@ def plot(
         for picture in write_sweep_figures(read_sweep(what), what.with_suffix("")):
             console.print(str(picture), soft_wrap=True, highlight=False)
         return 0
-    from canwall.plots import plot_run
     from canwall.record import RunFolder
+    from canwall.record.pictures import plot_run
 
     console.print(str(plot_run(RunFolder(what))), soft_wrap=True, highlight=False)
     return 0

@@ -10,7 +10,6 @@ from canwall.config.hand import Hand, Move, RandomStrikes
 from canwall.config.reading import ConfigError, absolute_law, first_error, load, overridden, shipped
 from canwall.config.settings import (
     Bus,
-    Change,
     Estimator,
     Limits,
     Mechanics,
@@ -19,6 +18,7 @@ from canwall.config.settings import (
     Settings,
     Stage,
     Wall,
+    WallChange,
 )
 from canwall.config.simulation import Simulation
 
@@ -27,7 +27,6 @@ __all__ = [
     "NUMBERS",
     "ON_FRAMES",
     "Bus",
-    "Change",
     "ConfigError",
     "Direction",
     "Drive",
@@ -45,6 +44,7 @@ __all__ = [
     "Simulation",
     "Stage",
     "Wall",
+    "WallChange",
     "absolute_law",
     "first_error",
     "load",

@@ -126,7 +126,7 @@ class LimitsChange(Section):
     energy_j: Positive | None = None
 
 
-class Change(Section):
+class WallChange(Section):
     """Keys of `[wall]`, and `limits`, that have other values from now on."""
 
     law: str | None = None
@@ -151,7 +151,7 @@ class Change(Section):
         return wall.model_copy(update=update), limits
 
 
-class Scheduled(Change):
+class Scheduled(WallChange):
     """`[[schedule]]`: a change, and when it comes."""
 
     at_s: NonNegative

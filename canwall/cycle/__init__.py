@@ -1,9 +1,10 @@
 """The SYNC-driven loop: exchange of frames, one compiled step, timing, limits and trips."""
 
-from canwall.cycle.axis import Axis, Change
+from canwall.cycle.axis import WallAxis, WallStage
+from canwall.cycle.bus_monitor import BusMonitor
 from canwall.cycle.delay import measured_delay
 from canwall.cycle.exchange import Exchange, PythonCanExchange
-from canwall.cycle.laws import run_laws
+from canwall.cycle.laws import named_law, run_laws, with_law
 from canwall.cycle.loop import Outcome, run_loop
 from canwall.cycle.machine import real_time_machine
 from canwall.cycle.native import NativeExchange
@@ -13,14 +14,12 @@ from canwall.cycle.step import step
 from canwall.cycle.sync import ExternalSync, ProducedSync
 from canwall.cycle.timing import HISTOGRAM, buckets_ns, observe_ns, percentile_ns, timing_summary
 from canwall.cycle.trips import Trip
-from canwall.cycle.watch import Watch
 
 __all__ = [
     "CYCLE",
     "HISTOGRAM",
     "MAX_LAWS",
-    "Axis",
-    "Change",
+    "BusMonitor",
     "Exchange",
     "ExternalSync",
     "Grant",
@@ -29,11 +28,13 @@ __all__ = [
     "ProducedSync",
     "PythonCanExchange",
     "Trip",
-    "Watch",
+    "WallAxis",
+    "WallStage",
     "buckets_ns",
     "fade_in",
     "make_cycle",
     "measured_delay",
+    "named_law",
     "observe_ns",
     "percentile_ns",
     "real_time_machine",
@@ -44,4 +45,5 @@ __all__ = [
     "start_at",
     "step",
     "timing_summary",
+    "with_law",
 ]

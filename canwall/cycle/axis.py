@@ -16,7 +16,7 @@ from canwall.walls import Law
 
 
 @dataclass(frozen=True)
-class Change:
+class WallStage:
     """From cycle j on, this is the wall, and these are its limits."""
 
     j: int
@@ -25,7 +25,7 @@ class Change:
 
 
 @dataclass
-class Axis:
+class WallAxis:
     """A drive that is set up, its wall, and where its rows go."""
 
     node: DriveNode
@@ -33,7 +33,7 @@ class Axis:
     settings: Settings
     laws: Sequence[Law]
     ring: Ring
-    changes: list[Change] = field(default_factory=list)
+    changes: list[WallStage] = field(default_factory=list)
     #: What other processes want changed while the wall is rendered.
     mailbox: Mailbox | None = None
     #: Why the wall was given up, where it is something that came beside the cycle.

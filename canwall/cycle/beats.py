@@ -6,17 +6,17 @@ from collections.abc import Iterable
 import can
 
 from canwall.drive import Link, Watchdog
-from canwall.drive.watchdog import Beat
+from canwall.drive.watchdog import ErrorControlFrame
 
 
-def periods_ns(watchdogs: Iterable[Watchdog]) -> dict[Beat, int]:
+def periods_ns(watchdogs: Iterable[Watchdog]) -> dict[ErrorControlFrame, int]:
     """The signs of life that these watchdogs want to hear, and how often each.
 
     Drives that listen to the same heartbeat get it as often as the shortest one wants.
     """
-    periods: dict[Beat, float] = {}
+    periods: dict[ErrorControlFrame, float] = {}
     for watchdog in watchdogs:
-        beat = watchdog.beat
+        beat = watchdog.error_control
         if beat is not None:
             periods[beat] = min(watchdog.period_s, periods.get(beat, watchdog.period_s))
     return {beat: round(period * 1e9) for beat, period in periods.items()}

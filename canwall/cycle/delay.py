@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 from canwall.compiled import Record, compiled
 from canwall.config import Mechanics
-from canwall.cycle.axis import Axis
+from canwall.cycle.axis import WallAxis
 from canwall.physics import advance, make_plant
 from canwall.walls import MAX_DELAY
 
@@ -36,7 +36,7 @@ _LONGEST, _AVERAGED = 8, 33
 class DelayTest:
     """Shakes one axis and listens."""
 
-    def __init__(self, axis: Axis) -> None:
+    def __init__(self, axis: WallAxis) -> None:
         settings = axis.settings
         self.axis = axis
         self.cycles = settings.estimator.measure_cycles

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from canwall.bus import DataFrame
 from canwall.compiled import data_to_number, number_to_data
-from canwall.cycle.axis import Axis
+from canwall.cycle.axis import WallAxis
 from canwall.cycle.beats import Beats
-from canwall.cycle.frames import CyclicFrame
 from canwall.cycle.step import step
 from canwall.cycle.sync import ProducedSync, SyncSource
 from canwall.cycle.timing import HISTOGRAM, observe_ns
@@ -41,7 +41,7 @@ class Exchange(ABC):
     #: How many cycles it may do before the loop looks after everything else again.
     ahead = 1
 
-    def __init__(self, link: Link, axes: Sequence[Axis], real_time: bool) -> None:
+    def __init__(self, link: Link, axes: Sequence[WallAxis], real_time: bool) -> None:
         self._link = link
         self.axes = axes
         self._real_time = real_time
@@ -77,7 +77,7 @@ class Exchange(ABC):
     def close(self) -> None:  # noqa: B027 (only some have anything to give back)
         """Give back what the exchange has opened; the link stays open."""
 
-    def _check_late(self, axis: Axis) -> None:
+    def _check_late(self, axis: WallAxis) -> None:
         """Give the wall up whose RPDOs have come too late for too many cycles."""
         most = axis.limits.late_cycles
         if most and axis.late_in_a_row >= most:
@@ -106,7 +106,7 @@ class PythonCanExchange(Exchange):
     def __init__(
         self,
         link: Link,
-        axes: Sequence[Axis],
+        axes: Sequence[WallAxis],
         real_time: bool,
         sync: SyncSource | None = None,
     ) -> None:
@@ -118,7 +118,8 @@ class PythonCanExchange(Exchange):
         )
         self._by_tpdo = {axis.setup.tpdo.cob_id: axis for axis in axes}
         self._rpdos = {
-            id(axis): CyclicFrame(axis.setup.rpdo.cob_id, axis.setup.rpdo.length) for axis in axes
+            id(axis): DataFrame(axis.setup.rpdo.cob_id, bytes(axis.setup.rpdo.length))
+            for axis in axes
         }
         self._beats = Beats(link, (axis.setup.watchdog for axis in axes))
         self._last_sync_ns = 0
@@ -171,7 +172,7 @@ class PythonCanExchange(Exchange):
         return interval * 1e-9
 
     def _answer(
-        self, axis: Axis, data: int, received: bool, received_ns: int, interval_s: float
+        self, axis: WallAxis, data: int, received: bool, received_ns: int, interval_s: float
     ) -> None:
         answer = step(axis.cycle, axis.row, data, received)
         rpdo = self._rpdos[id(axis)]
@@ -193,7 +194,7 @@ class PythonCanExchange(Exchange):
         put_row(axis.ring.header, axis.ring.rows, axis.row)
 
 
-def _warm_up(axis: Axis) -> None:
+def _warm_up(axis: WallAxis) -> None:
     # What is compiled is loaded at its first call, which takes longer than many a cycle.
     cycle, row = axis.cycle.copy(), axis.row.copy()
     for phase in Phase:

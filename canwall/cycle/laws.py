@@ -1,8 +1,11 @@
 """The laws that one run may render its wall by."""
 
-from canwall.config import ConfigError, Settings
+from pathlib import Path
+from typing import Any
+
+from canwall.config import ConfigError, Settings, absolute_law
 from canwall.cycle.state import MAX_LAWS
-from canwall.walls import Law, UnknownLawError, find_law
+from canwall.walls import DEADBEAT, Law, UnknownLawError, find_law
 
 
 def run_laws(settings: Settings) -> list[Law]:
@@ -27,3 +30,18 @@ def run_laws(settings: Settings) -> list[Law]:
     if len(laws) > MAX_LAWS:
         raise ConfigError(f"schedule: {len(laws)} laws; a run may change among {MAX_LAWS}")
     return list(laws.values())
+
+
+def with_law(settings: Settings, law: str) -> Settings:
+    """The wall rendered by that law, +deadbeat where it is compensated."""
+    name = absolute_law(law, Path())
+    deadbeat = name.endswith(DEADBEAT)
+    wall: dict[str, Any] = {"law": name.removesuffix(DEADBEAT), "deadbeat": deadbeat}
+    if name != named_law(settings):
+        wall["options"] = {}  # they were the other law's
+    return settings.model_copy(update={"wall": settings.wall.model_copy(update=wall)})
+
+
+def named_law(settings: Settings) -> str:
+    """The configuration's law as a value of the axis."""
+    return settings.wall.law + (DEADBEAT if settings.wall.deadbeat else "")

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import can
 
 from canwall import config
-from canwall.cycle.axis import Axis, Change
+from canwall.cycle.axis import WallAxis, WallStage
 from canwall.cycle.delay import DelayTest
 from canwall.cycle.exchange import Exchange
 from canwall.cycle.state import fade_in, fade_over, set_delay, set_limits, set_wall, start_at
@@ -22,8 +22,8 @@ from canwall.cycle.trips import Trip
 from canwall.drive import (
     Controlword,
     DriveError,
+    DriveState,
     Enabling,
-    State,
     controlword_down,
     disable,
     disarm,
@@ -41,7 +41,7 @@ _SILENT_CYCLES = 50
 #: SYNCs in which a drive that does not follow its RPDOs may still hear of its end from them.
 _LAST_RPDOS = 5
 #: States in which a drive gives no torque until it is enabled anew.
-_DISABLED = (State.SWITCH_ON_DISABLED, State.FAULT)
+_DISABLED = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
 #: Cycles before enabling in which position and statusword have to arrive; in real time no less
 #: than so long [s]: either process may have other things to do.
 _FIRST_CYCLES, _FIRST_S = 10, 0.2
@@ -147,7 +147,7 @@ class _Loop:
         for axis in self._axes:
             axis.cycle["phase"] = phase
 
-    def _say(self, axis: Axis, text: str) -> str:
+    def _say(self, axis: WallAxis, text: str) -> str:
         return text if len(self._axes) == 1 else f"{axis.name}: {text}"
 
     def enable(self) -> None:
@@ -158,11 +158,11 @@ class _Loop:
         for _ in range(_ENABLE_CYCLES):
             if self._stop():
                 return
-            enabled = [_is_enabled(*pair) for pair in zip(self._axes, ways, strict=True)]
+            enabled = [_advance_enabling(*pair) for pair in zip(self._axes, ways, strict=True)]
             if all(enabled):
                 return
             for axis, way in zip(self._axes, ways, strict=True):
-                if way.in_vain:
+                if way.gave_up:
                     returns = f"the fault comes back after every reset{latest_emergency(axis)}"
                     raise _WallGivenUpError(self._say(axis, returns))
                 if _is_silent(axis):
@@ -171,7 +171,7 @@ class _Loop:
             self._exchange.cycle()
             self._check()
         for axis, way in zip(self._axes, ways, strict=True):
-            if not _is_enabled(axis, way):
+            if not _advance_enabling(axis, way):
                 stays = f"the drive stays in {shown_state(axis)}{latest_emergency(axis)}"
                 raise _WallGivenUpError(self._say(axis, stays))
 
@@ -210,7 +210,7 @@ class _Loop:
                 self._progress(self.j)
         return False
 
-    def _most(self, cycles: int | None, pending: list[tuple[Axis, list[Change]]]) -> int:
+    def _most(self, cycles: int | None, pending: list[tuple[WallAxis, list[WallStage]]]) -> int:
         """Cycles until there is something to be done: the end, progress to be told, a change."""
         ends = [self.j + self._exchange.ahead]
         ends.append((self.j // self._progress_every + 1) * self._progress_every)
@@ -306,7 +306,7 @@ class _Loop:
         return True
 
 
-def _change(axis: Axis, changes: list[Change], period: float) -> None:
+def _change(axis: WallAxis, changes: list[WallStage], period: float) -> None:
     """Change wall and limits where it is time to, each change once the one before is complete."""
     cycle, mailbox = axis.cycle, axis.mailbox
     if cycle["fade_left"][0]:
@@ -325,7 +325,7 @@ def _change(axis: Axis, changes: list[Change], period: float) -> None:
         axis.wall, axis.limits = change.wall, change.limits
         axis.turns = axis.settings.laws_in_turn(change.wall)
     if mailbox is not None and mailbox.waiting():
-        posted = config.Change.model_validate_json(mailbox.take(j))
+        posted = config.WallChange.model_validate_json(mailbox.take(j))
         axis.wall, axis.limits = posted.applied_to(axis.wall, axis.limits)
         # A law that was asked for ends the turns; all else holds for the walls in turn as well.
         walls = [axis.wall] if posted.law else axis.turns
@@ -334,18 +334,18 @@ def _change(axis: Axis, changes: list[Change], period: float) -> None:
     set_limits(cycle, axis.limits)
 
 
-def _is_enabled(axis: Axis, way: Enabling) -> bool:
+def _advance_enabling(axis: WallAxis, way: Enabling) -> bool:
     """Whether the drive shows OPERATION ENABLED; sets the controlword that leads there."""
     statusword = int(axis.cycle["statusword"][0])
     axis.cycle["controlword"] = way.next(statusword)
-    return state_of(statusword) is State.OPERATION_ENABLED
+    return state_of(statusword) is DriveState.OPERATION_ENABLED
 
 
-def _is_down(axis: Axis) -> bool:
+def _is_down(axis: WallAxis) -> bool:
     """Whether the drive has shown, since it is being left, that it gives no torque."""
     state = state_of(int(axis.cycle["statusword"][0]))
     return state in _DISABLED and bool(axis.row["phase"][0] == Phase.LEAVING)
 
 
-def _is_silent(axis: Axis) -> bool:
+def _is_silent(axis: WallAxis) -> bool:
     return bool(axis.cycle["missed_in_a_row"][0] >= _SILENT_CYCLES)

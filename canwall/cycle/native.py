@@ -6,10 +6,12 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
+from canwall.bus import CycleSocket, bus_error
+from canwall.bus.can_ids import EMCY, ERROR_CONTROL, PDOS
+from canwall.bus.raw_socket import CFunction, place_port
 from canwall.compiled import data_to_number
-from canwall.cycle.axis import Axis
+from canwall.cycle.axis import WallAxis
 from canwall.cycle.beats import periods_ns
-from canwall.cycle.cyclic_socket import CyclicSocket
 from canwall.cycle.exchange import Exchange
 from canwall.cycle.native_cycle import (
     AT_ONCE,
@@ -25,16 +27,13 @@ from canwall.cycle.native_cycle import (
     run,
 )
 from canwall.cycle.sync import SyncLostError, sync_patience_s
-from canwall.drive import Link, bus_error
-from canwall.drive.watchdog import Beat
-from canwall.rawcan import CFunction, place_port
+from canwall.drive import Link
+from canwall.drive.watchdog import ErrorControlFrame
 from canwall.record.ring import FRAME, HEADER, RECEIVED, Ring, to_message
 
 #: A drive that answers within this time after a SYNC is awaited awake.
 LOOK_NS = 30_000
 
-_EMCY, _ERROR_CONTROL = 0x080, 0x700
-_PDOS = range(0x180, 0x580)
 #: A full transmit buffer is waited for no longer than this in simulated time, and so much of a
 #: cycle in real time.
 _SEND_PATIENCE_S, _SEND_SHARE = 1.0, 0.2
@@ -60,7 +59,7 @@ class NativeExchange(Exchange):
     name = "native"
 
     def __init__(
-        self, link: Link, axes: Sequence[Axis], real_time: bool, external_sync: bool = False
+        self, link: Link, axes: Sequence[WallAxis], real_time: bool, external_sync: bool = False
     ) -> None:
         """With `external_sync` somebody else produces the SYNC.
 
@@ -72,11 +71,11 @@ class NativeExchange(Exchange):
         treatment = np.zeros(0x800, np.uint8)
         treatment[setup.sync_cob_id] = AT_ONCE
         for axis in axes:
-            treatment[_EMCY + axis.node.node_id] = AT_ONCE
-            treatment[_ERROR_CONTROL + axis.node.node_id] = UNLESS_OPERATIONAL
+            treatment[EMCY + axis.node.node_id] = AT_ONCE
+            treatment[ERROR_CONTROL + axis.node.node_id] = UNLESS_OPERATIONAL
         tpdos = [axis.setup.tpdo.cob_id for axis in axes]
         rpdos = [axis.setup.rpdo.cob_id for axis in axes]
-        self._socket = CyclicSocket(
+        self._socket = CycleSocket(
             link.bus,
             received=[*tpdos, *np.flatnonzero(treatment).tolist()],
             sent=[setup.sync_cob_id, *rpdos, *(beat.can_id for beat in beats)],
@@ -197,7 +196,7 @@ class NativeExchange(Exchange):
         if len(subscribed) != self._subscribed:
             self._subscribed = len(subscribed)
             treatment = self._treatment.copy()
-            for can_id in _PDOS:
+            for can_id in PDOS:
                 if not subscribed.get(can_id):
                     treatment[can_id] = UNSEEN
             self._exchange["treatment"] = treatment
@@ -226,7 +225,7 @@ class NativeExchange(Exchange):
         self._socket.close()
 
 
-def _axis_records(axes: Sequence[Axis]) -> NDArray[np.void]:
+def _axis_records(axes: Sequence[WallAxis]) -> NDArray[np.void]:
     records = np.zeros(len(axes), AXIS)
     for record, axis in zip(records, axes, strict=True):
         tpdo, rpdo = axis.setup.tpdo, axis.setup.rpdo
@@ -245,7 +244,7 @@ def _axis_records(axes: Sequence[Axis]) -> NDArray[np.void]:
     return records
 
 
-def _beat_records(beats: Mapping[Beat, int]) -> NDArray[np.void]:
+def _beat_records(beats: Mapping[ErrorControlFrame, int]) -> NDArray[np.void]:
     records = np.zeros(len(beats), BEAT)
     for record, (beat, period_ns) in zip(records, beats.items(), strict=True):
         record["can_id"] = beat.can_id | (CAN_RTR if beat.remote else 0)

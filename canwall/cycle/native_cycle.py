@@ -15,13 +15,7 @@ from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from canwall.compiled import Record, compiled
-from canwall.cycle.exchange import BACKLOG
-from canwall.cycle.state import CYCLE
-from canwall.cycle.step import step
-from canwall.cycle.sync import SPIN_NS
-from canwall.cycle.timing import HISTOGRAM, observe_ns
-from canwall.rawcan import (
+from canwall.bus.raw_socket import (
     CLOSED,
     FAILED,
     FRAME,
@@ -35,6 +29,12 @@ from canwall.rawcan import (
     wait_readable,
     wall_clock_ns,
 )
+from canwall.compiled import Record, compiled
+from canwall.cycle.exchange import BACKLOG
+from canwall.cycle.state import CYCLE
+from canwall.cycle.step import step
+from canwall.cycle.sync import SPIN_NS
+from canwall.cycle.timing import HISTOGRAM, observe_ns
 from canwall.record.ring import (
     ERROR,
     EXTENDED,

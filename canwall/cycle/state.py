@@ -9,17 +9,17 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from canwall.analysis.metrics import STRIKE_GAP_S
 from canwall.config import Limits, Settings, Wall
 from canwall.drive import DriveSetup, PdoLayout
 from canwall.drive import objects as od
-from canwall.metrics import STRIKE_GAP_S
 from canwall.walls import (
     ESTIMATOR,
     TENSION,
     WALL,
     Law,
+    clear_memory,
     find_law,
-    forget,
     reset_estimator,
     set_estimator,
     set_plant,
@@ -52,7 +52,7 @@ RENDERED = np.dtype(
         ("estimated_velocity", "?"),
         ("divider", "i8"),  # the law is asked every so many cycles
         ("wall", WALL, (1,)),
-        # State: cycles since the law was asked, its force, its sample, the time since then.
+        # DriveState: cycles since the law was asked, its force, its sample, the time since then.
         ("waited", "i8"),
         ("force", "f8"),
         ("y_before", "f8"),
@@ -101,7 +101,7 @@ CYCLE = np.dtype(
         ("phase", "i8"),
         ("controlword", "i8"),
         ("test_per_mille", "i8"),
-        # State.
+        # DriveState.
         ("j", "i8"),
         ("counts", "i8"),
         ("statusword", "i8"),
@@ -238,7 +238,7 @@ def set_wall(cycle: NDArray[np.void], wall: Wall, laws: Sequence[Law]) -> None:
     known["passivity_damping"] = wall.passivity_nm_s_per_rad
     if index != rendered["law"]:
         rendered["law"] = index
-        forget(known)
+        clear_memory(known)
 
 
 def fade_over(cycle: NDArray[np.void], cycles: int) -> None:

@@ -9,17 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
-from canwall.cycle.trips import Trip, compare_position, compare_torque, watch
+from canwall.cycle.trips import Trip, check_limits, compare_position, compare_torque
 from canwall.record import Phase
 from canwall.units import to_per_mille
 from canwall.walls import (
     acting_force,
     actuation_state,
-    carry_on,
-    commit,
-    note_force,
-    observe,
-    pick_up,
+    correct,
+    predict,
+    predict_open_loop,
+    restart_estimate,
+    set_applied_force,
     wall_force,
 )
 
@@ -62,7 +62,7 @@ def read_inputs(cycles: NDArray[np.void], data: int) -> None:
 
 
 @compiled
-def _look(cycle: Record, rendered: Record, due: bool) -> None:
+def _set_wall_inputs(cycle: Record, rendered: Record, due: bool) -> None:
     """Show a wall what there is to be seen of the handle, relative to itself.
 
     The estimator works on the drive's axis, turned towards the wall: it does not notice when the
@@ -84,7 +84,7 @@ def _look(cycle: Record, rendered: Record, due: bool) -> None:
 
 
 @compiled
-def _is_due(rendered: Record, received: bool) -> bool:
+def _advance_divider(rendered: Record, received: bool) -> bool:
     """Whether the law is asked in this cycle: every so many, and not without a sample."""
     rendered.waited += 1
     if not received or rendered.waited < rendered.divider:
@@ -107,8 +107,8 @@ def _force_of(cycle: Record, rendered: Record, due: bool) -> float:
 def _faded_force(cycle: Record, force: float, received: bool) -> float:
     """The wall's force on its way from the wall before."""
     faded = cycle.faded[0]
-    due = _is_due(faded, received)
-    _look(cycle, faded, due)
+    due = _advance_divider(faded, received)
+    _set_wall_inputs(cycle, faded, due)
     before = _force_of(cycle, faded, due)
     share = cycle.fade_left / (cycle.fade_cycles + 1.0)
     cycle.fade_left -= 1
@@ -134,7 +134,7 @@ def _held_force(cycle: Record) -> float:
 def _wanted_force(cycle: Record, received: bool, due: bool) -> float:
     """Force out of the wall from the instant of actuation on; sets the trip that ends it."""
     if received:
-        watch(cycle)
+        check_limits(cycle)
     elif not cycle.trip:
         return _held_force(cycle)
     if cycle.trip:
@@ -154,7 +154,7 @@ def _wanted_force(cycle: Record, received: bool, due: bool) -> float:
 
 
 @compiled
-def _keep_books(cycle: Record, received: bool) -> None:
+def _account_contact(cycle: Record, received: bool) -> None:
     """Energy that the wall has put out in this contact, and the strikes that are over.
 
     W = Σ f_applied[j]·(y[j+1] − y[j]) (theory, section 5), from the beginning of a contact on.
@@ -200,16 +200,16 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
         cycle.missed_in_a_row += 1
         cycle.missed_tpdo += 1
     came_from = cycle.oriented
-    _keep_books(cycle, received)
+    _account_contact(cycle, received)
     if received:
         compare_position(cycle, cycle.counts - before, missed)
         if missed > _BLIND_CYCLES:
             pause = (1 + missed) * cycle.period
-            pick_up(estimator, cycle.oriented, (cycle.oriented - came_from) / pause)
-        observe(estimator, cycle.oriented)
+            restart_estimate(estimator, cycle.oriented, (cycle.oriented - came_from) / pause)
+        correct(estimator, cycle.oriented)
     active = cycle.phase == _RENDERING or cycle.phase == _MEASURING
-    due = _is_due(rendered, received) or (received and not active)
-    _look(cycle, rendered, due)
+    due = _advance_divider(rendered, received) or (received and not active)
+    _set_wall_inputs(cycle, rendered, due)
 
     force = 0.0
     if active:
@@ -218,12 +218,12 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     torque = per_mille * cycle.nm_per_mille
     sent = cycle.orientation * torque
     if cycle.frozen and cycle.frozen < cycle.stuck_cycles:
-        carry_on(estimator, sent)
-    commit(estimator, sent)
+        predict_open_loop(estimator, sent)
+    predict(estimator, sent)
     cycle.force_applied = acting_force(estimator)
     if due:
-        note_force(wall, sent)
-        note_force(cycle.faded[0].wall[0], sent)
+        set_applied_force(wall, sent)
+        set_applied_force(cycle.faded[0].wall[0], sent)
     cycle.torque_per_mille = per_mille
 
     row.j = cycle.j

@@ -5,7 +5,7 @@ from typing import Protocol
 
 import can
 
-from canwall.cycle.frames import CyclicFrame
+from canwall.bus import DataFrame
 from canwall.drive import Link
 
 #: The last part of a wait is spent awake: a sleep ends when the scheduler likes.
@@ -57,7 +57,7 @@ class ProducedSync:
         self._counter = 0
         self._period_ns = round(period_s * 1e9)
         self._real_time = real_time
-        self._message = CyclicFrame(cob_id, 1 if overflow else 0)
+        self._message = DataFrame(cob_id, bytes(1 if overflow else 0))
         self.deadline_ns = 0
 
     def next(self) -> int:

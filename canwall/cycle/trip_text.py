@@ -1,17 +1,17 @@
 """What ended a wall, in words: what, when, by how much, and where to look."""
 
-from canwall.cycle.axis import Axis
+from canwall.cycle.axis import WallAxis
 from canwall.cycle.exchange import Exchange
 from canwall.cycle.trips import Trip
 from canwall.drive import status_text
 
 
-def shown_state(axis: Axis) -> str:
+def shown_state(axis: WallAxis) -> str:
     """The state that the drive's latest statusword shows."""
     return status_text(int(axis.cycle["statusword"][0]))
 
 
-def latest_emergency(axis: Axis) -> str:
+def latest_emergency(axis: WallAxis) -> str:
     """The drive's latest EMCY, to be put behind what came of it; empty if there was none."""
     if not axis.node.emergencies:
         return ""
@@ -19,7 +19,7 @@ def latest_emergency(axis: Axis) -> str:
     return f"; EMCY {latest.code:#06x} ({latest.get_desc() or 'no description'})"
 
 
-def trip_text(axis: Axis, exchange: Exchange) -> str:
+def trip_text(axis: WallAxis, exchange: Exchange) -> str:
     """The trip that is set: its cycle, its value, and the key that it has passed."""
     cycle, row = axis.cycle[0], axis.row[0]
     j = int(row["j"])
@@ -64,11 +64,11 @@ def trip_text(axis: Axis, exchange: Exchange) -> str:
     return f"cycle {j} ({j * float(cycle['period']):.3f} s): {what}"
 
 
-def _jump_key(axis: Axis) -> str:
+def _jump_key(axis: WallAxis) -> str:
     return "limits.jump_rad" if axis.limits.jump_rad else "limits.speed_rad_s"
 
 
-def _too_short(axis: Axis) -> str:
+def _too_short(axis: WallAxis) -> str:
     if axis.wrong_length is None:
         return ""
     tpdo = axis.setup.tpdo
@@ -78,14 +78,14 @@ def _too_short(axis: Axis) -> str:
     )
 
 
-def _pause(axis: Axis, exchange: Exchange) -> str:
+def _pause(axis: WallAxis, exchange: Exchange) -> str:
     """Why a drive has left where it was its master that was not there."""
     watchdog, pause_s = axis.setup.watchdog, exchange.longest_pause_s()
     # The latest sign of life may have been a period old when the pause began.
-    before_s = watchdog.period_s if watchdog.beat else 0.0
+    before_s = watchdog.period_s if watchdog.error_control else 0.0
     if pause_s + before_s <= watchdog.time_s:
         return ""
-    every = f" for a frame every {before_s * 1e3:.0f} ms" if watchdog.beat else ""
+    every = f" for a frame every {before_s * 1e3:.0f} ms" if watchdog.error_control else ""
     return (
         f"; the master had stood still for {pause_s:.3g} s, the drive's watchdog "
         f"({watchdog.kind}) waits {watchdog.time_s * 1e3:g} ms{every}"

@@ -3,9 +3,9 @@
 from enum import IntEnum
 
 from canwall.compiled import Record, compiled
-from canwall.drive import State
+from canwall.drive import DriveState
 from canwall.record import Phase
-from canwall.walls import look_away
+from canwall.walls import start_open_loop
 
 
 class Trip(IntEnum):
@@ -37,7 +37,7 @@ _JUMP = int(Trip.JUMP)
 _STUCK = int(Trip.STUCK)
 _TORQUE = int(Trip.TORQUE)
 _LEAVING = int(Phase.LEAVING)
-_ENABLED_MASK, _ENABLED_VALUE = State.OPERATION_ENABLED.value
+_ENABLED_MASK, _ENABLED_VALUE = DriveState.OPERATION_ENABLED.value
 #: Statusword bit 11, internal limit active: the drive says itself that it gives less.
 _INTERNAL_LIMIT = 1 << 11
 #: A handle that is stopped within two cycles, its speed along half a wave of a cosine, goes 0.82
@@ -46,11 +46,11 @@ _INTERNAL_LIMIT = 1 << 11
 _LEAST_COUNTS = 4
 #: Torque [per mille of the rated one] with which a hand or friction may stop the handle without
 #: notice: at a hundred hertz that is done within a cycle, and the positions show no trace of it.
-_UNFORESEEN = 100.0
+_UNMODELLED = 100.0
 
 
 @compiled
-def watch(cycle: Record) -> None:
+def check_limits(cycle: Record) -> None:
     """Set the trip of a limit that is passed; one that is set stays."""
     if cycle.trip:
         return
@@ -76,7 +76,7 @@ def _is_stuck(cycle: Record) -> bool:
     Two witnesses have to agree, in direction as well: the model, which knows the torques, but may
     have the wrong mass, and is not shown the position that stays, for it soon believes it; and the
     last two changes of the position, carried on: a handle that was stopped slowed down, unless
-    _UNFORESEEN could do that within a cycle.
+    _UNMODELLED could do that within a cycle.
     Three positions that are rounded to counts leave 3 counts open of the change to which they
     carry on, 2·(y[j] − y[j−1]) − (y[j−1] − y[j−2]); the least of it counts. What is slower than
     _LEAST_COUNTS may have come to a stop within a count, unseen.
@@ -85,8 +85,8 @@ def _is_stuck(cycle: Record) -> bool:
     least = min(last - 1.0, 2.0 * last - before - 3.0)
     if least < _LEAST_COUNTS:
         return False
-    unforeseen = _UNFORESEEN * abs(cycle.nm_per_mille) / cycle.estimator[0].mass
-    went = least * abs(cycle.rad_per_count) - unforeseen * cycle.period**2
+    unmodelled = _UNMODELLED * abs(cycle.nm_per_mille) / cycle.estimator[0].mass
+    went = least * abs(cycle.rad_per_count) - unmodelled * cycle.period**2
     return min(went * cycle.stuck_cycles, cycle.motion_missed) > cycle.stuck_limit
 
 
@@ -110,9 +110,9 @@ def compare_position(cycle: Record, change: int, missed: int) -> None:
     else:
         cycle.frozen += 1
         if cycle.frozen == 1:
-            look_away(cycle.estimator[0])
+            start_open_loop(cycle.estimator[0])
         if cycle.frozen <= cycle.stuck_cycles:
-            ahead = cycle.estimator[0].unseen_y - cycle.oriented
+            ahead = cycle.estimator[0].open_loop_y - cycle.oriented
             if cycle.orientation * cycle.rad_per_count * cycle.change < 0.0:
                 ahead = -ahead
             cycle.motion_missed = max(cycle.motion_missed, ahead)

@@ -3,43 +3,40 @@
 One python-can bus, one thread: what waits for an answer reads the bus itself.
 """
 
-from canwall.drive.bus_errors import bus_error, reason
 from canwall.drive.cia402 import (
     Controlword,
+    DriveState,
     Enabling,
-    State,
     controlword_down,
     controlword_up,
     state_of,
     status_text,
 )
 from canwall.drive.link import Link
-from canwall.drive.masters import refuse_second_master
 from canwall.drive.node import DriveError, DriveNode
+from canwall.drive.other_masters import refuse_second_master
 from canwall.drive.pdo import Field, PdoLayout
 from canwall.drive.setup import REQUIRED_OBJECTS, DriveSetup, disable, set_up
-from canwall.drive.watchdog import NO_WATCHDOG, Beat, Watchdog, disarm
+from canwall.drive.watchdog import NO_WATCHDOG, ErrorControlFrame, Watchdog, disarm
 
 __all__ = [
     "NO_WATCHDOG",
     "REQUIRED_OBJECTS",
-    "Beat",
     "Controlword",
     "DriveError",
     "DriveNode",
     "DriveSetup",
+    "DriveState",
     "Enabling",
+    "ErrorControlFrame",
     "Field",
     "Link",
     "PdoLayout",
-    "State",
     "Watchdog",
-    "bus_error",
     "controlword_down",
     "controlword_up",
     "disable",
     "disarm",
-    "reason",
     "refuse_second_master",
     "set_up",
     "state_of",

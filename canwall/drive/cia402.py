@@ -6,7 +6,7 @@ Pure functions of the statusword, so they serve a cycle as well as a set-up over
 from enum import Enum, IntEnum
 
 
-class State(Enum):
+class DriveState(Enum):
     """States of the power drive system (CiA 402-2), with mask and value of the statusword."""
 
     NOT_READY_TO_SWITCH_ON = (0x4F, 0x00)
@@ -49,52 +49,52 @@ _BITS = {
 }
 
 
-def state_of(statusword: int) -> State:
+def state_of(statusword: int) -> DriveState:
     """The state that a statusword (0x6041) shows."""
-    for state in State:
+    for state in DriveState:
         mask, value = state.value
         if statusword & mask == value:
             return state
-    return State.NOT_READY_TO_SWITCH_ON  # the masks leave no other; a drive starting up shows it
+    return DriveState.NOT_READY_TO_SWITCH_ON  # no other is left
 
 
 def status_text(statusword: int) -> str:
-    """State and bits of a statusword, for people."""
+    """DriveState and bits of a statusword, for people."""
     bits = [name for bit, name in _BITS.items() if statusword >> bit & 1]
     said = f": {', '.join(bits)}" if bits else ""
     return f"{state_of(statusword)} (statusword {statusword:#06x}{said})"
 
 
 _UP = {
-    State.NOT_READY_TO_SWITCH_ON: Controlword.DISABLE_VOLTAGE,
-    State.SWITCH_ON_DISABLED: Controlword.SHUTDOWN,
-    State.READY_TO_SWITCH_ON: Controlword.SWITCH_ON,
-    State.SWITCHED_ON: Controlword.ENABLE_OPERATION,
-    State.OPERATION_ENABLED: Controlword.ENABLE_OPERATION,
+    DriveState.NOT_READY_TO_SWITCH_ON: Controlword.DISABLE_VOLTAGE,
+    DriveState.SWITCH_ON_DISABLED: Controlword.SHUTDOWN,
+    DriveState.READY_TO_SWITCH_ON: Controlword.SWITCH_ON,
+    DriveState.SWITCHED_ON: Controlword.ENABLE_OPERATION,
+    DriveState.OPERATION_ENABLED: Controlword.ENABLE_OPERATION,
     # Transition 16 back to OPERATION ENABLED is optional; through SWITCH ON DISABLED every drive
     # goes.
-    State.QUICK_STOP_ACTIVE: Controlword.DISABLE_VOLTAGE,
-    State.FAULT_REACTION_ACTIVE: Controlword.DISABLE_VOLTAGE,
-    State.FAULT: Controlword.FAULT_RESET,
+    DriveState.QUICK_STOP_ACTIVE: Controlword.DISABLE_VOLTAGE,
+    DriveState.FAULT_REACTION_ACTIVE: Controlword.DISABLE_VOLTAGE,
+    DriveState.FAULT: Controlword.FAULT_RESET,
 }
 
 _DOWN = {
-    State.OPERATION_ENABLED: Controlword.SWITCH_ON,  # transition 5, disable operation
-    State.SWITCHED_ON: Controlword.SHUTDOWN,
+    DriveState.OPERATION_ENABLED: Controlword.SWITCH_ON,  # transition 5, disable operation
+    DriveState.SWITCHED_ON: Controlword.SHUTDOWN,
 }
 
 
-def controlword_up(state: State, previous: int) -> int:
+def controlword_up(state: DriveState, previous: int) -> int:
     """Next controlword on the way to OPERATION ENABLED, from any state.
 
     The fault reset acts on the rising edge of bit 7, so it alternates with a word without it.
     """
-    if state is State.FAULT and previous & Controlword.FAULT_RESET:
+    if state is DriveState.FAULT and previous & Controlword.FAULT_RESET:
         return Controlword.DISABLE_VOLTAGE
     return _UP[state]
 
 
-def controlword_down(state: State) -> int:
+def controlword_down(state: DriveState) -> int:
     """Next controlword on the way to SWITCH ON DISABLED, from any state, step by step."""
     return _DOWN.get(state, Controlword.DISABLE_VOLTAGE)
 
@@ -117,7 +117,7 @@ class Enabling:
     def next(self, statusword: int) -> int:
         """Controlword to send now. HALT and every other stale bit are clear in all of them."""
         state = state_of(statusword)
-        faulty = state is State.FAULT
+        faulty = state is DriveState.FAULT
         if faulty and not self._faulty:
             self._resets += 1
         self._faulty = faulty
@@ -125,6 +125,6 @@ class Enabling:
         return self._controlword
 
     @property
-    def in_vain(self) -> bool:
+    def gave_up(self) -> bool:
         """Whether the fault has come back after as many resets as make sense."""
         return self._resets > _RESETS

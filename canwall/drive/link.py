@@ -17,8 +17,8 @@ import canopen
 from canopen.sdo import SdoClient
 from canopen.sdo.exceptions import SdoCommunicationError
 
-from canwall.drive.bus_errors import explained
-from canwall.rawcan import QUEUE_PATIENCE_NS, QUEUE_RETRY_NS, CFunction
+from canwall.bus.errors import explained
+from canwall.bus.raw_socket import QUEUE_PATIENCE_NS, QUEUE_RETRY_NS, CFunction
 
 # What fails is raised; canopen logs it as well, which without a handler goes to stderr.
 logging.getLogger("canopen").addHandler(logging.NullHandler())

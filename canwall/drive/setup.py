@@ -4,10 +4,11 @@ import math
 import time
 from dataclasses import dataclass
 
+from canwall.bus.can_ids import SYNC
 from canwall.config import Bus as BusSettings
 from canwall.config import Drive as DriveSettings
 from canwall.drive import objects as od
-from canwall.drive.cia402 import Controlword, State, state_of, status_text
+from canwall.drive.cia402 import Controlword, DriveState, state_of, status_text
 from canwall.drive.identity import Identity, identify
 from canwall.drive.mode import Mode, select_mode, steepest_slope
 from canwall.drive.node import DriveError, DriveNode
@@ -35,7 +36,6 @@ _MEASURED_TOO = (od.TORQUE_ACTUAL_VALUE, od.VELOCITY_ACTUAL_VALUE)
 _COMMANDED = (od.CONTROLWORD, od.TARGET_TORQUE)
 
 _DISABLING_S = 2.0
-_SYNC_CAN_ID = 0x80
 
 #: A watchdog shorter than this many cycles would bite a master that lives.
 _WATCHDOG_CYCLES = 3
@@ -106,7 +106,7 @@ def set_up(
         bus.master_id,
         settings.accept_no_watchdog,
     )
-    sync = node.read(od.SYNC_COB_ID) & 0x7FF if node.has(od.SYNC_COB_ID) else _SYNC_CAN_ID
+    sync = node.read(od.SYNC_COB_ID) & 0x7FF if node.has(od.SYNC_COB_ID) else SYNC
     node.command("OPERATIONAL")
     return DriveSetup(
         scales.units,
@@ -133,7 +133,7 @@ def disable(node: DriveNode) -> None:
     node.write(od.CONTROLWORD, 0, Controlword.DISABLE_VOLTAGE)
     while True:
         statusword = node.read(od.STATUSWORD)
-        if state_of(statusword) in (State.SWITCH_ON_DISABLED, State.FAULT):
+        if state_of(statusword) in (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT):
             return
         if time.monotonic() >= deadline:
             raise DriveError(

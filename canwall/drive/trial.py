@@ -5,7 +5,7 @@ import time
 import can
 
 from canwall.drive import objects as od
-from canwall.drive.cia402 import Enabling, State, controlword_down, state_of, status_text
+from canwall.drive.cia402 import DriveState, Enabling, controlword_down, state_of, status_text
 from canwall.drive.node import DriveError, DriveNode
 from canwall.drive.setup import DriveSetup
 
@@ -21,7 +21,7 @@ class Trial:
         self._setup = setup
         self._cycle_s = cycle_s
         self._count = 0
-        beat = setup.watchdog.beat
+        beat = setup.watchdog.error_control
         self._beat = None if beat is None else _message(beat.can_id, beat.data, beat.remote)
         self._beat_due = 0.0
         self.last_sign_of_life = 0.0
@@ -75,10 +75,10 @@ class Trial:
             statusword = self.cycle(controlword)
             if statusword is not None:
                 status = status_text(statusword)
-                if state_of(statusword) is State.OPERATION_ENABLED:
+                if state_of(statusword) is DriveState.OPERATION_ENABLED:
                     return
                 controlword = enabling.next(statusword)
-            if enabling.in_vain:
+            if enabling.gave_up:
                 raise self._stuck(f"the fault comes back after every reset: {status}")
             if time.monotonic() >= deadline:
                 raise self._stuck(f"the drive stays in {status}, not OPERATION ENABLED")
@@ -91,7 +91,7 @@ class Trial:
             statusword = self.cycle(controlword)
             if statusword is not None:
                 state, status = state_of(statusword), status_text(statusword)
-                if state in (State.SWITCH_ON_DISABLED, State.FAULT):
+                if state in (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT):
                     return
                 controlword = controlword_down(state)
             if time.monotonic() >= deadline:

@@ -9,11 +9,11 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from canwall.bus.can_ids import ERROR_CONTROL
 from canwall.drive import objects as od
 from canwall.drive.node import DriveError, DriveNode
 from canwall.drive.pdo import PdoLayout, while_off
 
-_ERROR_CONTROL = 0x700
 _OPERATIONAL = 5
 _EVENT_TIMER = 5
 _MAX_MS = 0xFFFF
@@ -26,7 +26,7 @@ _REACTIONS = {2: "disable voltage", 1: "fault", 3: "quick stop"}
 
 
 @dataclass(frozen=True)
-class Beat:
+class ErrorControlFrame:
     """A frame by which the master shows that it lives."""
 
     can_id: int
@@ -48,7 +48,7 @@ class Watchdog:
 
     kind: str
     time_s: float = math.inf
-    beat: Beat | None = None
+    error_control: ErrorControlFrame | None = None
     period_s: float = math.inf
     reaction: str = "nothing"
     passed_over: tuple[str, ...] = ()
@@ -56,7 +56,7 @@ class Watchdog:
     def __str__(self) -> str:
         if self.kind == "none":
             return "none: a master that dies leaves the torque on"
-        every = f", a frame every {self.period_s * 1e3:g} ms" if self.beat else ""
+        every = f", a frame every {self.period_s * 1e3:g} ms" if self.error_control else ""
         return f"{self.kind}, {self.time_s * 1e3:g} ms{every}; then {self.reaction}"
 
 
@@ -72,7 +72,7 @@ def arm(
     """
     passed_over: list[str] = []
     time_ms = min(math.ceil(round(time_s * 1e3, 6)), _MAX_MS)
-    ways: tuple[tuple[str, Callable[[], tuple[float, Beat | None, float]]], ...] = (
+    ways: tuple[tuple[str, Callable[[], tuple[float, ErrorControlFrame | None, float]]], ...] = (
         ("RPDO event timer", lambda: _rpdo_event_timer(node, rpdo, time_ms)),
         ("consumer heartbeat", lambda: _consumer_heartbeat(node, time_ms, master_id)),
         ("life guarding", lambda: _life_guarding(node, time_ms)),
@@ -102,8 +102,8 @@ def disarm(node: DriveNode, rpdo: PdoLayout, watchdog: Watchdog) -> None:
     if watchdog.kind == "RPDO event timer":
         with while_off(node, rpdo.communication):
             node.write(rpdo.communication, _EVENT_TIMER, 0)
-    elif watchdog.kind == "consumer heartbeat" and watchdog.beat is not None:
-        master_id = watchdog.beat.can_id - _ERROR_CONTROL
+    elif watchdog.kind == "consumer heartbeat" and watchdog.error_control is not None:
+        master_id = watchdog.error_control.can_id - ERROR_CONTROL
         for subindex in _heartbeat_entries(node):
             if node.read(od.CONSUMER_HEARTBEAT_TIME, subindex) >> 16 == master_id:
                 node.write(od.CONSUMER_HEARTBEAT_TIME, subindex, 0)
@@ -118,7 +118,7 @@ def _heartbeat_entries(node: DriveNode) -> list[int]:
 
 def _rpdo_event_timer(
     node: DriveNode, rpdo: PdoLayout, time_ms: int
-) -> tuple[float, Beat | None, float]:
+) -> tuple[float, ErrorControlFrame | None, float]:
     if not node.has(rpdo.communication, _EVENT_TIMER):
         raise DriveError(f"no 0x{rpdo.communication:04X}:05")
     with while_off(node, rpdo.communication):
@@ -128,7 +128,7 @@ def _rpdo_event_timer(
 
 def _consumer_heartbeat(
     node: DriveNode, time_ms: int, master_id: int
-) -> tuple[float, Beat | None, float]:
+) -> tuple[float, ErrorControlFrame | None, float]:
     entries = _heartbeat_entries(node)
     if not entries:
         raise DriveError("no 0x1016")
@@ -140,11 +140,11 @@ def _consumer_heartbeat(
     if present[free[0]]:
         node.set(od.CONSUMER_HEARTBEAT_TIME, free[0], 0)
     node.set(od.CONSUMER_HEARTBEAT_TIME, free[0], master_id << 16 | time_ms)
-    beat = Beat(_ERROR_CONTROL + master_id, bytes([_OPERATIONAL]))
+    beat = ErrorControlFrame(ERROR_CONTROL + master_id, bytes([_OPERATIONAL]))
     return time_ms * 1e-3, beat, time_ms * 1e-3 / _BEATS
 
 
-def _life_guarding(node: DriveNode, time_ms: int) -> tuple[float, Beat | None, float]:
+def _life_guarding(node: DriveNode, time_ms: int) -> tuple[float, ErrorControlFrame | None, float]:
     if not (node.has(od.GUARD_TIME) and node.has(od.LIFE_TIME_FACTOR)):
         raise DriveError("no 0x100C, 0x100D")
     # A node that sends heartbeats is not guarded (CiA 301, 7.2.8.3.2).
@@ -153,7 +153,7 @@ def _life_guarding(node: DriveNode, time_ms: int) -> tuple[float, Beat | None, f
     guard_ms = math.ceil(time_ms / _BEATS)
     node.set(od.GUARD_TIME, 0, guard_ms)
     node.set(od.LIFE_TIME_FACTOR, 0, _BEATS)
-    beat = Beat(_ERROR_CONTROL + node.node_id, remote=True)
+    beat = ErrorControlFrame(ERROR_CONTROL + node.node_id, remote=True)
     return guard_ms * _BEATS * 1e-3, beat, guard_ms * 1e-3
 
 

@@ -4,7 +4,7 @@ Everything is compiled and free of allocation on the hot path. Nothing here know
 control laws, of drives or of CAN.
 """
 
-from canwall.physics.contact import Grasp, Hand, advance_grasp
+from canwall.physics.contact import Grasp, HandBody, advance_grasp
 from canwall.physics.motion import MAX_EVENTS, PLANT, advance, contact_end, make_plant, time_to_wall
 from canwall.physics.oscillator import acceleration, basis, flow, zoh, zoh_coefficients
 from canwall.physics.smooth import Force
@@ -14,7 +14,7 @@ __all__ = [
     "PLANT",
     "Force",
     "Grasp",
-    "Hand",
+    "HandBody",
     "acceleration",
     "advance",
     "advance_grasp",

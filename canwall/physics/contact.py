@@ -18,19 +18,19 @@ from canwall.physics.motion import (
     slide,
 )
 from canwall.physics.smooth import (
+    EventFunction,
     Force,
     Smooth,
-    Watch,
     departure,
+    event_value,
     first_turn,
     largest_acceleration,
     later,
     state,
-    watched,
 )
 
 
-class Hand(NamedTuple):
+class HandBody(NamedTuple):
     """The hand as a body, about where its force law puts it; side −1.0 presses down, 1.0 up."""
 
     mass: float
@@ -89,17 +89,17 @@ def _time_to_close(handle: Smooth, hand: Smooth, side: float, span: float) -> fl
 
 
 @compiled
-def contact_force(hand: Hand, script: Force, y: float, v: float, a: float) -> float:
+def contact_force(hand: HandBody, script: Force, y: float, v: float, a: float) -> float:
     """What the hand presses with while it moves with the handle; negative where it would pull."""
     push = script.constant - hand.viscous * v - hand.spring * y - hand.mass * a
     return hand.side * push
 
 
 @compiled
-def _pressing(hand: Hand, script: Force) -> Watch:
-    """`contact_force` as a function of time, to be watched along the motion of both."""
+def _pressing(hand: HandBody, script: Force) -> EventFunction:
+    """`contact_force` as a function of time, to be event_value along the motion of both."""
     side = hand.side
-    return Watch(
+    return EventFunction(
         side * script.constant,
         side * script.slope,
         -side * hand.spring,
@@ -110,7 +110,7 @@ def _pressing(hand: Hand, script: Force) -> Watch:
 
 @compiled
 def _together(
-    joined: Record, hand: Hand, now: Grasp, motor: Force, script: Force, remaining: float
+    joined: Record, hand: HandBody, now: Grasp, motor: Force, script: Force, remaining: float
 ) -> tuple[float, Grasp]:
     """Motion of both as one up to the next event: (duration, grasp then)."""
     total = Force(
@@ -129,11 +129,11 @@ def _together(
             return press / fading, Grasp(y, v, y, v, False)
         if stuck >= remaining:
             return remaining, Grasp(y, v, y, v, True)
-    watch = _pressing(hand, later(script, stuck))
-    if watched(motion, watch, 0, 0.0)[0] < 0.0:
+    event = _pressing(hand, later(script, stuck))
+    if event_value(motion, event, 0, 0.0)[0] < 0.0:
         return stuck, Grasp(y, v, y, v, False)
     dt, y, v = slide(piece, motion, direction, remaining - stuck)
-    parting = first_turn(motion, watch, 1.0, dt)
+    parting = first_turn(motion, event, 1.0, dt)
     if parting < dt:
         y, v = state(motion, parting)
         return stuck + parting, Grasp(y, v, y, v, False)
@@ -151,7 +151,7 @@ def _impact(handle: Smooth, hand: Smooth, t: float) -> Grasp:
 
 @compiled
 def _apart(
-    handle: Record, hand: Hand, now: Grasp, motor: Force, script: Force, remaining: float
+    handle: Record, hand: HandBody, now: Grasp, motor: Force, script: Force, remaining: float
 ) -> tuple[float, Grasp]:
     """Motion of each alone up to the next event: (duration, grasp then)."""
     y, v = now.y, now.v
@@ -202,7 +202,7 @@ def _apart(
 def advance_grasp(
     handle: Record,
     joined: Record,
-    hand: Hand,
+    hand: HandBody,
     now: Grasp,
     motor: Force,
     script: Force,

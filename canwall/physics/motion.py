@@ -21,9 +21,9 @@ from canwall.physics.oscillator import acceleration
 from canwall.physics.smooth import (
     ACCELERATION,
     VELOCITY,
+    EventFunction,
     Force,
     Smooth,
-    Watch,
     first_turn,
     later,
     root,
@@ -165,10 +165,10 @@ def _time_to_break_loose(
             return math.inf, 0.0
         direction = 1.0 if force.slope > 0.0 else -1.0
         return max(coulomb - direction * pull, 0.0) / abs(force.slope), direction
-    # A free unit mass is accelerated by what pulls: what is left of the friction is watched.
+    # A free unit mass is accelerated by what pulls: what is left of the friction is event_value.
     free = Smooth(1.0, 0.0, 0.0, 0.0, 0.0, pull, force.slope, force.excess, force.rate)
-    up = first_turn(free, Watch(coulomb, 0.0, 0.0, 0.0, -1.0), 1.0, horizon)
-    down = first_turn(free, Watch(coulomb, 0.0, 0.0, 0.0, 1.0), 1.0, horizon)
+    up = first_turn(free, EventFunction(coulomb, 0.0, 0.0, 0.0, -1.0), 1.0, horizon)
+    down = first_turn(free, EventFunction(coulomb, 0.0, 0.0, 0.0, 1.0), 1.0, horizon)
     return (up, 1.0) if up <= down else (down, -1.0)
 
 
@@ -262,7 +262,7 @@ def slide(
         y_end, v_end = state(motion, dt)
     edge = piece.upper if direction > 0.0 else piece.lower
     if (direction > 0.0 and y_end >= edge) or (direction < 0.0 and y_end < edge):
-        dt = root(motion, Watch(-edge, 0.0, 1.0, 0.0, 0.0), 0, 0.0, dt, direction > 0.0)
+        dt = root(motion, EventFunction(-edge, 0.0, 1.0, 0.0, 0.0), 0, 0.0, dt, direction > 0.0)
         _, v_end = state(motion, dt)
         return dt, edge, v_end
     if dt < span or direction * v_end <= 0.0:
@@ -329,7 +329,7 @@ def time_to_wall(plant: Record, y: float, v: float, u: float, duration: float) -
     the end of the interval vouches for.
     """
     motion = Smooth(plant.mass, plant.viscous, plant.spring, y, v, u, 0.0, 0.0, 0.0)
-    return root(motion, Watch(0.0, 0.0, 1.0, 0.0, 0.0), 0, 0.0, duration, False)
+    return root(motion, EventFunction(0.0, 0.0, 1.0, 0.0, 0.0), 0, 0.0, duration, False)
 
 
 #: Segments (of a quarter period each, at most) after which a contact is taken for one that does

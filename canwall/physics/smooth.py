@@ -49,7 +49,7 @@ class Smooth(NamedTuple):
     rate: float
 
 
-class Watch(NamedTuple):
+class EventFunction(NamedTuple):
     """constant + slope·t + position·y + velocity·ẏ + acceleration·ÿ: events are its zeros."""
 
     constant: float
@@ -59,8 +59,8 @@ class Watch(NamedTuple):
     acceleration: float
 
 
-VELOCITY = Watch(0.0, 0.0, 0.0, 1.0, 0.0)
-ACCELERATION = Watch(0.0, 0.0, 0.0, 0.0, 1.0)
+VELOCITY = EventFunction(0.0, 0.0, 0.0, 1.0, 0.0)
+ACCELERATION = EventFunction(0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 @compiled
@@ -124,13 +124,13 @@ def largest_acceleration(motion: Smooth, span: float) -> float:
 
 
 @compiled
-def watched(motion: Smooth, watch: Watch, order: int, t: float) -> tuple[float, float]:
-    """A watched function, differentiated `order` times, and its slope, at time t.
+def event_value(motion: Smooth, event: EventFunction, order: int, t: float) -> tuple[float, float]:
+    """A event_value function, differentiated `order` times, and its slope, at time t.
 
     Order 3 stands for (D + rate)·D², which leaves a damped oscillation of everything.
     """
     m = motion
-    w = watch
+    w = event
     y0, y1 = state(m, t)
     left = m.excess * math.exp(-m.rate * t) if m.excess != 0.0 else 0.0
     force = m.constant + m.slope * t
@@ -160,12 +160,14 @@ def watched(motion: Smooth, watch: Watch, order: int, t: float) -> tuple[float, 
 
 
 @compiled
-def root(motion: Smooth, watch: Watch, order: int, low: float, high: float, rising: bool) -> float:
-    """The root of a watched function in (low, high]: Newton kept in its bracket."""
+def root(
+    motion: Smooth, event: EventFunction, order: int, low: float, high: float, rising: bool
+) -> float:
+    """The root of an event function in (low, high]: Newton kept in its bracket."""
     rounding = 4e-16 * high
     t = 0.5 * (low + high)
     for _ in range(_MAX_ITERATIONS):
-        value, slope = watched(motion, watch, order, t)
+        value, slope = event_value(motion, event, order, t)
         if (value < 0.0) == rising:
             low = t
         else:
@@ -183,8 +185,8 @@ def root(motion: Smooth, watch: Watch, order: int, low: float, high: float, risi
 
 
 @compiled
-def first_turn(motion: Smooth, watch: Watch, sign: float, span: float) -> float:
-    """First time in (0, span] at which a watched function has turned against `sign`, else inf.
+def first_turn(motion: Smooth, event: EventFunction, sign: float, span: float) -> float:
+    """First time in (0, span] at which a event_value function has turned against `sign`, else inf.
 
     span is at most a quarter period of the oscillator.
     """
@@ -196,12 +198,12 @@ def first_turn(motion: Smooth, watch: Watch, sign: float, span: float) -> float:
         # Of two edges between which the sign changes, the next lower order has its one zero there.
         zeros[0] = 0.0
         found = 1
-        before = sign if order == 0 else watched(motion, watch, order, 0.0)[0]
+        before = sign if order == 0 else event_value(motion, event, order, 0.0)[0]
         since = 0.0
         for i in range(1, count):
-            value, _ = watched(motion, watch, order, edges[i])
+            value, _ = event_value(motion, event, order, edges[i])
             if value * before < 0.0:
-                zero = root(motion, watch, order, since, edges[i], before < 0.0)
+                zero = root(motion, event, order, since, edges[i], before < 0.0)
                 if order == 0:
                     return zero
                 zeros[found] = zero

@@ -8,15 +8,15 @@ from canopen.objectdictionary import ObjectDictionary
 
 from canwall.config import ConfigError, Settings
 from canwall.cycle import (
-    Axis,
-    Change,
+    BusMonitor,
     Exchange,
     ExternalSync,
     Grant,
     NativeExchange,
     Outcome,
     PythonCanExchange,
-    Watch,
+    WallAxis,
+    WallStage,
     real_time_machine,
     run_loop,
 )
@@ -41,7 +41,7 @@ def make_axis(
     dictionary: ObjectDictionary,
     laws: Sequence[Law],
     ring: Ring,
-) -> Axis:
+) -> WallAxis:
     """Set the drive up for its wall, the rows of its cycles going into the ring.
 
     `dictionary` is what `[drive] eds` describes. Nothing is enabled yet. Raises DriveError.
@@ -55,12 +55,12 @@ def make_axis(
         raise
     period = settings.bus.cycle_s
     changes = [
-        Change(round(at_s / period), wall, limits) for at_s, wall, limits in settings.stages[1:]
+        WallStage(round(at_s / period), wall, limits) for at_s, wall, limits in settings.stages[1:]
     ]
-    return Axis(node, setup, settings, laws, ring, changes)
+    return WallAxis(node, setup, settings, laws, ring, changes)
 
 
-def make_exchange(link: Link, axes: Sequence[Axis]) -> Exchange:
+def make_exchange(link: Link, axes: Sequence[WallAxis]) -> Exchange:
     """The cycle of all axes, on the SYNC and by the exchange that `[bus]` says.
 
     Raises DriveError, and ConfigError for an exchange that the bus does not have.
@@ -91,10 +91,10 @@ def make_exchange(link: Link, axes: Sequence[Axis]) -> Exchange:
     return PythonCanExchange(link, axes, settings.real_time, sync)
 
 
-def make_watch(link: Link, axes: Sequence[Axis]) -> Watch:
+def make_monitor(link: Link, axes: Sequence[WallAxis]) -> BusMonitor:
     """What ends the walls beside the cycle; a second SYNC as well, where the master sends it."""
     external = axes[0].settings.bus.sync == "external"
-    return Watch(link, axes, None if external else axes[0].setup.sync_cob_id)
+    return BusMonitor(link, axes, None if external else axes[0].setup.sync_cob_id)
 
 
 def render(
@@ -113,13 +113,13 @@ def render(
 
 
 @contextmanager
-def restored() -> Iterator[tuple[list[Axis], dict[str, list[str]]]]:
+def restored() -> Iterator[tuple[list[WallAxis], dict[str, list[str]]]]:
     """Axes whose drives are put back at the end, where `[drive] restore` asks for it.
 
     Yields the list to fill with them, and what will be left by their names: that which could not
     be put back.
     """
-    axes: list[Axis] = []
+    axes: list[WallAxis] = []
     left: dict[str, list[str]] = {}
     try:
         yield axes, left

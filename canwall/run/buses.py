@@ -7,9 +7,9 @@ from functools import partial
 import can
 
 from canwall import simdrive
+from canwall.bus import reason, socket_pair
 from canwall.config import ConfigError, Settings
-from canwall.drive import Link, reason, refuse_second_master
-from canwall.pair import pair
+from canwall.drive import Link, refuse_second_master
 
 
 def open_bus(settings: Settings) -> can.BusABC:
@@ -79,7 +79,7 @@ def on_the_bus(*many: Settings) -> Iterator[Link]:
     drives = [make_simulated_drive(settings) for settings in many]
     with ExitStack() as stack:
         if len(many) == 1 and many[0].bus.exchange == "native":
-            bus, drive_bus = (stack.enter_context(end) for end in pair(many[0].bus.channel))
+            bus, drive_bus = (stack.enter_context(end) for end in socket_pair(many[0].bus.channel))
             runner = simdrive.CompiledRunner(drives[0], drive_bus)
             yield Link(bus, runner.poll, runner.compiled)
             return

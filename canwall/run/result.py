@@ -7,12 +7,12 @@ from typing import Any
 import pyarrow as pa
 
 from canwall.config import ConfigError, Settings
-from canwall.cycle import Axis, Exchange, Grant, Outcome, Watch, timing_summary
+from canwall.cycle import BusMonitor, Exchange, Grant, Outcome, WallAxis, timing_summary
 from canwall.drive import DriveSetup
 from canwall.errors import RunFailedError
 from canwall.record import RecordError, RunFolder, read_signals
-from canwall.referent import referent_positions
-from canwall.summary import summarise
+from canwall.record.summary import summarise
+from canwall.run.referent import referent_positions
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class RunResult:
 
 
 def result_of(
-    axis: Axis,
+    axis: WallAxis,
     exchange: Exchange,
-    watch: Watch,
+    monitor: BusMonitor,
     machine: dict[str, Grant],
     folder: RunFolder,
     outcome: Outcome,
@@ -45,7 +45,7 @@ def result_of(
     summary |= {
         "missed_tpdo": int(axis.cycle["missed_tpdo"][0]),
         "late_rpdo": axis.late_rpdo,
-        "error_frames": watch.error_frames,
+        "error_frames": monitor.error_frames,
         "trips": outcome.trips,
         "trip_cycle": outcome.trip_cycle,
         "interrupted": outcome.interrupted,
@@ -66,7 +66,7 @@ def result_of(
     return RunResult(folder, summary, outcome, notes, remarks)
 
 
-def _by_the_clock(axis: Axis, exchange: Exchange) -> dict[str, Any]:
+def _by_the_clock(axis: WallAxis, exchange: Exchange) -> dict[str, Any]:
     """What there is in real time alone; an RPDO has until the next SYNC, which is a cycle."""
     return {
         "sync_error": timing_summary(exchange.sync_error),

@@ -9,19 +9,19 @@ from pathlib import Path
 
 from canwall.config import ConfigError, Settings
 from canwall.cycle import run_laws
-from canwall.live import open_to_changes
-from canwall.plots import plot_run
 from canwall.record import Recorder, RunFolder
+from canwall.record.pictures import plot_run
 from canwall.run.assembly import (
     drive_dictionary,
     make_axis,
     make_exchange,
-    make_watch,
+    make_monitor,
     render,
     restored,
     scheduled,
 )
 from canwall.run.buses import on_the_bus
+from canwall.run.changes import open_to_changes
 from canwall.run.result import RunResult, remarks_on, result_of
 from canwall.run.stopping import stop_on_signals
 
@@ -81,7 +81,7 @@ def run_together(
                 ):
                     axes.append(make_axis(link, settings, dictionary, known, recorder.ring))
                 exchange = make_exchange(link, axes)
-                watch = make_watch(link, axes)
+                monitor = make_monitor(link, axes)
                 report("rendering")
                 with (
                     closing(exchange),
@@ -99,10 +99,10 @@ def run_together(
     report("summarising")
     results = []
     for axis, folder, noted in zip(axes, folders, notes, strict=True):
-        said = [*noted, *watch.notes] if axis is axes[0] else noted
+        said = [*noted, *monitor.notes] if axis is axes[0] else noted
         remarks = [*remarks_on(axis.setup, axis.settings), *not_restored.get(axis.name, [])]
         remarks += outcome.notes if axis is axes[0] else []
-        results.append(result_of(axis, exchange, watch, machine, folder, outcome, said, remarks))
+        results.append(result_of(axis, exchange, monitor, machine, folder, outcome, said, remarks))
     report("drawing")
     for folder in folders:
         plot_run(folder)

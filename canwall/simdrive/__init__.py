@@ -17,7 +17,7 @@ from canwall.simdrive.mechanics.servo import (
     make_servo,
     move_servo,
 )
-from canwall.simdrive.profile.axis import Motion
+from canwall.simdrive.profile.power_drive_system import Motion
 from canwall.simdrive.runner import BusRunner, Device
 
 __all__ = [

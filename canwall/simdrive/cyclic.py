@@ -12,8 +12,7 @@ import numpy as np
 from numba import cfunc, types
 from numpy.typing import NDArray
 
-from canwall.compiled import Record, compiled
-from canwall.rawcan import (
+from canwall.bus.raw_socket import (
     FRAME,
     PORT,
     CFunction,
@@ -22,6 +21,7 @@ from canwall.rawcan import (
     receive,
     send,
 )
+from canwall.compiled import Record, compiled
 from canwall.simdrive.mechanics.servo import SERVO, move_servo
 
 MAX_TPDOS, MAX_FIELDS = 4, 4
@@ -38,7 +38,7 @@ FIELD = np.dtype([("value", "i8"), ("shift", "i8"), ("bits", "i8")])
 TPDO = np.dtype(
     [("can_id", "i8"), ("length", "i8"), ("fields", FIELD, (MAX_FIELDS,)), ("count", "i8")]
 )
-#: State and parameters on loan.
+#: PdsState and parameters on loan.
 CYCLIC = np.dtype(
     [
         ("port", PORT, (1,)),

@@ -4,7 +4,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import TypeAlias
 
-from canwall.simdrive.communication import lss, nmt, rpdo, tpdo
+from canwall.bus.can_ids import LSS_REQUEST, NMT
+from canwall.simdrive.communication import rpdo, tpdo
 from canwall.simdrive.communication.dictionary import Dictionary, Key
 from canwall.simdrive.communication.emcy import (
     COMMUNICATION,
@@ -25,8 +26,8 @@ from canwall.simdrive.communication.store import ParameterStore
 from canwall.simdrive.communication.sync import SyncConsumer
 from canwall.simdrive.communication.tpdo import Tpdo
 from canwall.simdrive.mechanics.actuator import Actuator
-from canwall.simdrive.profile.axis import Axis, Motion
 from canwall.simdrive.profile.hardware import Hardware
+from canwall.simdrive.profile.power_drive_system import Motion, PowerDriveSystem
 
 Receive: TypeAlias = Callable[[bytes], None]
 """Takes the data of the frames with one CAN-ID."""
@@ -115,7 +116,9 @@ class SimulatedDrive:
         send = self._outbox.append
         self._emcy = EmergencyProducer(dictionary, send)
         self._store = ParameterStore(dictionary, self._memory)
-        self._axis = Axis(dictionary, self._motion, self._emcy, self._hardware, self._sync_period_s)
+        self._pds = PowerDriveSystem(
+            dictionary, self._motion, self._emcy, self._hardware, self._sync_period_s
+        )
         self._sync = SyncConsumer(
             dictionary, self._clock, self._emcy, self._route, self._connection_lost
         )
@@ -159,9 +162,9 @@ class SimulatedDrive:
         self._route()
 
     @property
-    def axis(self) -> Axis:
+    def axis(self) -> PowerDriveSystem:
         """The CiA 402 side of the drive."""
-        return self._axis
+        return self._pds
 
     @property
     def actuator(self) -> Actuator:
@@ -194,14 +197,14 @@ class SimulatedDrive:
 
     def switch_off(self) -> None:
         """Take the supply away: the drive is dead until ``boot``."""
-        self._axis.disable()
+        self._pds.disable()
         self._nmt.state = NmtState.INITIALISATION
         self._route()
         self._outbox.clear()
 
     def bus_off(self) -> None:
         """React to a controller that has left the bus (0x6007 and 0x1029)."""
-        self._axis.abort_connection(COMMUNICATION, _ABORT_CONNECTION)
+        self._pds.abort_connection(COMMUNICATION, _ABORT_CONNECTION)
         self._error_behaviour.communication_error()
 
     def bus_recovered(self) -> None:
@@ -242,10 +245,10 @@ class SimulatedDrive:
         if self.real_time:
             self._pass(dt / self._sync_period_s)
             self._apply_torque()
-        elif self._axis.slowing_down:
+        elif self._pds.slowing_down:
             self._go_on_without_sync(dt)
         if self._nmt.state is not NmtState.INITIALISATION:
-            self._axis.state_machine.step()
+            self._pds.state_machine.step()
             self._heartbeat_producer.tick(self._nmt.state)
             self._heartbeat_consumer.tick()
             self._guarding.tick()
@@ -286,12 +289,12 @@ class SimulatedDrive:
                 routes[self._sdo.can_id] = self._at_once(self._sdo.receive)
             # The world does not stand still where NMT wants no SYNC.
             routes[self._sync.can_id] = self._on_sync
-            routes[nmt.CAN_ID] = self._nmt.receive
-            routes[lss.CAN_ID] = self._lss.receive
+            routes[NMT] = self._nmt.receive
+            routes[LSS_REQUEST] = self._lss.receive
             remote_routes = {pdo.can_id: pdo.respond for pdo in tpdos if pdo.answers_remote}
             remote_routes |= self._guarding.routes(state)
         elif self._node_id == UNCONFIGURED:
-            routes = {lss.CAN_ID: self._lss.receive, self._sync.can_id: self._on_sync}
+            routes = {LSS_REQUEST: self._lss.receive, self._sync.can_id: self._on_sync}
         self._routes = routes
         self._remote_routes = remote_routes
 
@@ -310,9 +313,9 @@ class SimulatedDrive:
     def _pass(self, periods: float) -> None:
         """Let time pass for the physics, under the torque that has held until now."""
         actuator = self._actuator
-        if actuator.delayed and self._axis.motor_free:
+        if actuator.delayed and self._pds.motor_free:
             actuator.cut()
-        actuator.advance(self._axis.torque_nm, periods)
+        actuator.advance(self._pds.torque_nm, periods)
         self._passed_s += periods * self._sync_period_s
 
     def pass_sync(self) -> None:
@@ -329,10 +332,10 @@ class SimulatedDrive:
 
     def _apply_torque(self) -> None:
         """Let the target torque hold from now on."""
-        self._axis.apply_torque(self._passed_s)
+        self._pds.apply_torque(self._passed_s)
         self._passed_s = 0.0
         if not self._actuator.direct:
-            self._axis.show_torque(self._actuator.torque_nm(self._axis.torque_nm))
+            self._pds.show_torque(self._actuator.torque_nm(self._pds.torque_nm))
 
     def _go_on_without_sync(self, dt: float) -> None:
         """Let a drive come to rest whose SYNC, and so its master, has gone.
@@ -345,24 +348,24 @@ class SimulatedDrive:
             self._without_sync_s -= self._sync_period_s
             self._pass(1.0)
             self._apply_torque()
-            self._axis.sample()
+            self._pds.sample()
 
     def _on_sync(self, data: bytes) -> None:
         if self.passes_syncs:
             self.pass_sync()
         if not self._sync.receive(data):
             return
-        self._axis.state_machine.step()
+        self._pds.state_machine.step()
         for received in self._sync_rpdos:
             received.sync()
         self._apply_torque()
-        self._axis.sample()
+        self._pds.sample()
         for transmitted in self._sync_tpdos:
             transmitted.sync(self._sync.counter)
 
     def _leaving(self) -> None:
         if self._nmt.state is NmtState.OPERATIONAL:
-            self._axis.abort_connection(COMMUNICATION, _ABORT_CONNECTION)
+            self._pds.abort_connection(COMMUNICATION, _ABORT_CONNECTION)
 
     def _entered(self) -> None:
         self._emcy.silent = self._nmt.state is NmtState.STOPPED
@@ -374,7 +377,7 @@ class SimulatedDrive:
         self._route()
 
     def _reset(self, communication_only: bool) -> None:
-        self._axis.disable()
+        self._pds.disable()
         node_id = self._lss.node_id
         if node_id != self._node_id:
             # Another node-ID is another power-on, whichever reset it was.
@@ -386,7 +389,7 @@ class SimulatedDrive:
         self._store.load(communication_only=communication_only)
         self._emcy.reset(communication_only=communication_only)
         if not communication_only:
-            self._axis.reset()
+            self._pds.reset()
         self._sdo.reset()
         self._heartbeat_consumer.reset()
         self._guarding.reset()
@@ -404,7 +407,7 @@ class SimulatedDrive:
 
     def _connection_lost(self, code: int, source: Key) -> None:
         self._emcy.occurred(code, source)
-        self._axis.abort_connection(code, source)
+        self._pds.abort_connection(code, source)
 
     def _heartbeat_lost(self, source: Key) -> None:
         self._connection_lost(HEARTBEAT_LOST, source)

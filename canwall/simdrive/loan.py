@@ -11,9 +11,9 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
+from canwall.bus.raw_socket import place_port
+from canwall.bus.socket_pair import SocketPairBus
 from canwall.compiled import data_to_number, number_to_data
-from canwall.pair import PairBus
-from canwall.rawcan import place_port
 from canwall.simdrive.communication.nmt import NmtState
 from canwall.simdrive.communication.rpdo import Rpdo
 from canwall.simdrive.communication.tpdo import Tpdo
@@ -21,7 +21,7 @@ from canwall.simdrive.cyclic import CYCLIC, MAX_FIELDS, MAX_TPDOS, VALUES, servi
 from canwall.simdrive.drive import SimulatedDrive
 from canwall.simdrive.faults import FaultyDrive, FaultyEncoder
 from canwall.simdrive.mechanics.motion import ServoMotion
-from canwall.simdrive.profile.state_machine import State
+from canwall.simdrive.profile.state_machine import PdsState
 from canwall.simdrive.runner import BusRunner
 
 #: The drive's own timers are looked after this often [s].
@@ -34,7 +34,7 @@ _CONSTANT = (0x6041, 0x6061)
 class CompiledRunner(BusRunner):
     """A runner whose drive answers in compiled code while it may, at the other end of a pair."""
 
-    def __init__(self, drive: FaultyDrive, bus: PairBus) -> None:
+    def __init__(self, drive: FaultyDrive, bus: SocketPairBus) -> None:
         """Switch the drive on, as BusRunner does."""
         super().__init__(drive, bus)
         self._faulty = drive
@@ -93,10 +93,10 @@ def lend(faulty: FaultyDrive, record: NDArray[np.void]) -> bool:
 
 
 def _in_operation(drive: SimulatedDrive) -> bool:
-    axis, machine = drive._axis, drive._axis.state_machine
+    axis, machine = drive._pds, drive._pds.state_machine
     return (
         drive._nmt.state is NmtState.OPERATIONAL
-        and machine.state is State.OPERATION_ENABLED
+        and machine.state is PdsState.OPERATION_ENABLED
         and machine.ramp is None
         and machine._following is None
         and axis._follows_target
@@ -122,8 +122,8 @@ def _undisturbed(faulty: FaultyDrive) -> bool:
         and not drive._actuator.delayed
         and drive._actuator._part == 1.0
         and drive._sync._length == 0
-        and not drive._axis._inputs.wired
-        and not drive._axis._inputs.closed
+        and not drive._pds._inputs.wired
+        and not drive._pds._inputs.closed
     )
 
 
@@ -152,7 +152,7 @@ def _fill_frames(
     rpdo: Rpdo,
     tpdos: list[list[tuple[int, int, int]]],
 ) -> None:
-    axis = drive._axis
+    axis = drive._pds
     record["sync_id"] = drive._sync.can_id
     record["rpdo_id"], record["rpdo_length"] = rpdo.can_id, rpdo._struct.size
     torque_first = rpdo._entries[0].index == _TARGET
@@ -185,7 +185,7 @@ def _fill_frames(
 
 
 def _fill_torque(drive: SimulatedDrive, record: NDArray[np.void]) -> None:
-    torque = drive._axis._torque
+    torque = drive._pds._torque
     limit = min(torque._max_torque.value, torque._max_current.value, torque._peak)
     record["highest"] = min(limit, torque._positive_limit.value)
     record["lowest"] = -min(limit, torque._negative_limit.value)
@@ -209,7 +209,7 @@ def _fill_motion(drive: SimulatedDrive, record: NDArray[np.void]) -> None:
     record["piece"], record["piece_length"] = motion._elapsed - motion._first, len(constant)
     record["period"], record["smoothing"] = motion._period_s, motion._smoothing
     record["counts"], record["speed"] = motion._counts, motion._speed_counts_per_s
-    feedback = drive._axis._feedback
+    feedback = drive._pds._feedback
     record["position_sign"], record["position_shift"] = feedback._position_sign, feedback._shift
     record["position_scale"] = feedback._position_unit.per_increment
     record["speed_scale"] = feedback._units_per_count
@@ -226,7 +226,7 @@ def give_back(faulty: FaultyDrive, record: NDArray[np.void], passed_s: float) ->
     record["lent"] = False
     drive._clock.advance(passed_s)
     faulty._elapsed += passed_s / drive.sync_period_s
-    axis, rpdo = drive._axis, drive._sync_rpdos[0]
+    axis, rpdo = drive._pds, drive._sync_rpdos[0]
     values = [int(value) for value in lent["values"]]
     torque, feedback = axis._torque, axis._feedback
     (

@@ -3,10 +3,11 @@
 import errno
 import time
 from collections.abc import Callable, Iterable
-from typing import Any, Protocol
+from typing import Protocol
 
 import can
 
+from canwall.bus import DataFrame
 from canwall.simdrive.communication.frame import ERROR_FRAME, Frame
 
 _TICK_S = 0.001
@@ -39,22 +40,6 @@ class Device(Protocol):
     def tick(self, dt: float) -> list[Frame]:
         """Let ``dt`` seconds pass and return the frames that are due."""
         ...
-
-
-class _DataFrame(can.Message):
-    """A frame of the drive.
-
-    python-can's virtual bus copies each frame deeply for everyone on it, which by the general way
-    of copy.deepcopy takes several times as long as what the drive does in a cycle.
-    """
-
-    def __init__(self, can_id: int, data: bytes) -> None:
-        super().__init__(arbitration_id=can_id, is_extended_id=False, data=data)
-
-    def __deepcopy__(self, memo: dict[int, Any] | None) -> can.Message:
-        copy = _DataFrame(self.arbitration_id, bytes(self.data))
-        copy.timestamp = self.timestamp
-        return copy
 
 
 class BusRunner:
@@ -154,7 +139,7 @@ class BusRunner:
     def _send(self, frames: Iterable[Frame]) -> None:
         for can_id, data in frames:
             if not can_id & ERROR_FRAME:
-                self._bus.send(_DataFrame(can_id, data))
+                self._bus.send(DataFrame(can_id, data))
             elif self._error_frames:
                 self._bus.send(
                     can.Message(

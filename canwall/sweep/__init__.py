@@ -2,15 +2,15 @@
 
 from canwall.sweep.dataset import gathered
 from canwall.sweep.plan import Plan, make_plan
-from canwall.sweep.shown import sweep_table, without_effect
-from canwall.sweep.strike import OPERATORS, Operator, Strike
+from canwall.sweep.strike import OPERATORS, Operator, PreparedStrike
 from canwall.sweep.sweeping import read_sweep, sweep
+from canwall.sweep.tables import sweep_table, without_effect
 
 __all__ = [
     "OPERATORS",
     "Operator",
     "Plan",
-    "Strike",
+    "PreparedStrike",
     "gathered",
     "make_plan",
     "read_sweep",

@@ -3,17 +3,17 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from canwall.config import ConfigError, Settings, absolute_law, overridden
+from canwall.config import ConfigError, Settings, overridden
+from canwall.cycle import with_law
 from canwall.errors import InputError
+from canwall.run.closed_loop import known_scales, loop_delay
 from canwall.simdrive import TORQUE_LIMITS
-from canwall.sweep.closed_loop import known_scales, loop_delay
-from canwall.sweep.strike import OPERATORS, model_of, struck
-from canwall.walls import DEADBEAT, MAX_DELAY
+from canwall.sweep.strike import OPERATORS, model_of, strike_settings
+from canwall.walls import MAX_DELAY
 
 #: More values than this on one axis are a slip of the pen.
 _MOST_VALUES = 1_000_000
@@ -64,7 +64,7 @@ _CHOICES = {
 
 
 @dataclass(frozen=True)
-class Axis:
+class SweepAxis:
     """One axis: its name and its values, in order."""
 
     name: str
@@ -76,7 +76,7 @@ class Axis:
         return NAMED.get(self.name, ("", ""))[0]
 
 
-def parsed(name: str, given: object) -> Axis:
+def parsed(name: str, given: object) -> SweepAxis:
     """An axis from an array, one value, "A,B,C" or "LO:HI:N"; N steps, geometric for stiffness.
 
     "LO:HI:N:log" and "LO:HI:N:lin" say which. Raises InputError.
@@ -93,7 +93,7 @@ def parsed(name: str, given: object) -> Axis:
         raise InputError(f"sweep axis {name}: a value is there twice")
     for value in values:
         _check(name, value)
-    return Axis(name, values)
+    return SweepAxis(name, values)
 
 
 def _written(name: str, text: str) -> list[Value]:
@@ -175,7 +175,7 @@ def resolve(base: Settings, point: Point) -> Settings:
             update={"estimator": settings.estimator.model_copy(update=known)}
         )
     speed, phase, start, press = (float(values[n]) for n in ("speed", "phase", "start", "press"))
-    return struck(settings, speed, phase, start, press)
+    return strike_settings(settings, speed, phase, start, press)
 
 
 def _of_the_model(key: str) -> bool:
@@ -189,21 +189,6 @@ def _overridden(settings: Settings, keys: Mapping[str, Any]) -> Settings:
         return overridden(settings, keys)
     except ConfigError as error:
         raise ConfigError(f"sweep axis {error}") from None
-
-
-def with_law(settings: Settings, law: Value) -> Settings:
-    """The wall rendered by that law, +deadbeat where it is compensated."""
-    name = absolute_law(str(law), Path())
-    deadbeat = name.endswith(DEADBEAT)
-    wall: dict[str, Any] = {"law": name.removesuffix(DEADBEAT), "deadbeat": deadbeat}
-    if name != named_law(settings):
-        wall["options"] = {}  # they were the other law's
-    return settings.model_copy(update={"wall": settings.wall.model_copy(update=wall)})
-
-
-def named_law(settings: Settings) -> str:
-    """The configuration's law as a value of the axis."""
-    return settings.wall.law + (DEADBEAT if settings.wall.deadbeat else "")
 
 
 def _with_rate(settings: Settings, rate: Value) -> Settings:
@@ -255,7 +240,7 @@ def _with_operator(settings: Settings, name: Value) -> Settings:
 
 #: In the order in which they are made: a key of the configuration goes before all of them.
 _CHANGES: dict[str, Callable[[Settings, Value], Settings]] = {
-    "law": with_law,
+    "law": lambda settings, law: with_law(settings, str(law)),
     "rate": _with_rate,
     "delay": _with_delay,
     "counts": _with_counts,

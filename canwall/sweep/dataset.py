@@ -11,9 +11,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from canwall.analysis.strike import DESCRIBED
+from canwall.run.closed_loop import known_scales, loop_delay
 from canwall.sweep.axes import NAMED
-from canwall.sweep.closed_loop import known_scales, loop_delay
-from canwall.sweep.measures import DESCRIBED
 from canwall.sweep.plan import Plan
 from canwall.units import DriveUnits
 

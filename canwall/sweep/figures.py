@@ -14,9 +14,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from canwall.analysis.analytic_limits import stable_stiffness
 from canwall.errors import InputError
-from canwall.plots import COLOURS, STYLE
-from canwall.sweep.analytic import stable_stiffness
+from canwall.figure_style import COLOURS, STYLE
 from canwall.sweep.axes import DAMPING, STIFFNESS, STRIKES
 from canwall.sweep.labels import LABELS, circumstances, named, panel_title
 from canwall.sweep.z_width import draw_z_width

@@ -10,22 +10,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from canwall.analysis.k_limit import LIMITED, k_limits
+from canwall.analysis.strike import MEASURES
 from canwall.config import Settings
+from canwall.cycle import named_law
 from canwall.errors import InputError
 from canwall.sweep.axes import (
     DAMPING,
     DEFAULTS,
     STIFFNESS,
     STRIKES,
-    Axis,
+    SweepAxis,
     Value,
-    named_law,
     parsed,
     resolve,
 )
-from canwall.sweep.limit import LIMITED, k_limits
-from canwall.sweep.measures import MEASURES
-from canwall.sweep.strike import Strike
+from canwall.sweep.strike import PreparedStrike
 
 #: A piece of work and what was found, as `compute` returns it.
 Found = tuple[int, NDArray[np.void]]
@@ -43,15 +43,15 @@ class Plan:
     """
 
     base: Settings
-    conditions: tuple[Axis, ...]
-    stiffness: Axis | None
-    damping: Axis
-    speed: Axis
-    phase: Axis
+    conditions: tuple[SweepAxis, ...]
+    stiffness: SweepAxis | None
+    damping: SweepAxis
+    speed: SweepAxis
+    phase: SweepAxis
     through: str = "sim"
 
     @property
-    def axes(self) -> list[Axis]:
+    def axes(self) -> list[SweepAxis]:
         """All of them, in the order of the result's dimensions."""
         wall = [self.damping] if self.stiffness is None else [self.damping, self.stiffness]
         return [*self.conditions, *wall, self.speed, self.phase]
@@ -140,9 +140,9 @@ def make_plan(base: Settings, given: Mapping[str, object], through: str = "sim")
     defaults |= {name: DEFAULTS[name] for name in STRIKES}
     if not any(name in axes for name in DAMPING):
         defaults["damping"] = (base.wall.damping_nm_s_per_rad,)
-    axes = {n: Axis(n, tuple(v)) for n, v in defaults.items() if n not in axes} | axes
+    axes = {n: SweepAxis(n, tuple(v)) for n, v in defaults.items() if n not in axes} | axes
 
-    def taken(names: Sequence[str]) -> Axis | None:
+    def taken(names: Sequence[str]) -> SweepAxis | None:
         return next((axes.pop(name) for name in names if name in axes), None)
 
     stiffness, damping = taken(STIFFNESS), taken(DAMPING)
@@ -159,10 +159,10 @@ def make_plan(base: Settings, given: Mapping[str, object], through: str = "sim")
 def _try_out(plan: Plan) -> None:
     """Prepare a strike for each value of each axis, the others at their first."""
     first, strike = plan.points[0], plan.strikes[0]
-    Strike(plan.settings(first, strike))
+    PreparedStrike(plan.settings(first, strike))
     for axis in plan.conditions:
         for value in axis.values[1:]:
-            Strike(plan.settings({**first, axis.name: value}, strike))
+            PreparedStrike(plan.settings({**first, axis.name: value}, strike))
     for other in plan.strikes[1:]:
         plan.settings(first, other)
 
@@ -171,7 +171,9 @@ def compute(plan: Plan, piece: int) -> NDArray[np.void]:
     """One piece of work; shape (strikes, walls), dtype of the plan."""
     condition, strikes, walls = plan.where(piece)
     point = plan.points[condition]
-    prepared = [Strike(plan.settings(point, s), plan.through) for s in plan.strikes[strikes]]
+    prepared = [
+        PreparedStrike(plan.settings(point, s), plan.through) for s in plan.strikes[strikes]
+    ]
     mass, period = prepared[0].mass, prepared[0].period
     damping_unit = mass / period if plan.damping.name == "damping_normalised" else 1.0
     if plan.stiffness is None:

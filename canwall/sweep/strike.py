@@ -6,14 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from canwall.analysis import ReferentInputs, follow_referent
+from canwall.analysis.strike import MEASURES, measure
 from canwall.compiled import Record, compiled
 from canwall.config import ConfigError, Hand, Mechanics, Settings
 from canwall.cycle import run_laws
 from canwall.record import ROW, Phase, Ring
-from canwall.referent import Following, Referent, follow
 from canwall.run import drive_dictionary, make_axis, make_exchange, on_the_bus, render
-from canwall.sweep.closed_loop import ENABLING_CYCLES, ClosedLoop, Ready, close_on
-from canwall.sweep.measures import MEASURES, measure
+from canwall.run.closed_loop import ENABLING_CYCLES, ClosedLoop, LoopRecords, simulate_wall
+from canwall.run.referent import Referent
 
 Array = NDArray[np.float64]
 
@@ -89,7 +90,7 @@ def model_of(settings: Settings, knows: str, error: float) -> Mechanics:
     return model.model_copy(update={"inertia_kg_m2": model.inertia_kg_m2 * (1.0 + error)})
 
 
-def struck(
+def strike_settings(
     settings: Settings, speed_rad_s: float, phase: float, start_rad: float, press_s: float
 ) -> Settings:
     """The configuration's operator strikes the wall once, pressing with 0.15 N·m for press_s.
@@ -137,18 +138,18 @@ def struck(
     )
 
 
-class Strike:
+class PreparedStrike:
     """One strike, prepared, to be rendered against one wall after another, and measured."""
 
     def __init__(self, settings: Settings, through: str = "sim") -> None:
-        """settings: as `struck` gives them. through: "sim", in memory, or "bus", by frames."""
+        """settings: of `strike_settings`. through: "sim", in memory, or "bus", by frames."""
         assert settings.run.duration_s is not None
         assert settings.simulation is not None
         self._settings = settings
         self._cycles = round(settings.run.duration_s / settings.bus.cycle_s)
-        self._loop = ClosedLoop(settings, self._cycles).ready()
+        self._loop = ClosedLoop(settings, self._cycles).records()
         referent = Referent(settings, settings.simulation, self._cycles)
-        self._referent = referent.following(np.full(self._cycles, settings.wall.position_rad))
+        self._referent = referent.inputs(np.full(self._cycles, settings.wall.position_rad))
         self._by_frames = through == "bus"
 
     @property
@@ -186,7 +187,7 @@ class Strike:
         )
         referent = np.empty(self._cycles)
         each = np.full(self._cycles, stiffness), np.full(self._cycles, damping)
-        follow(self._referent, *each, referent)
+        follow_referent(self._referent, *each, referent)
         found = np.zeros(1, MEASURES)
         _judge(self._loop, signals, trip, referent, stiffness, found)
         return found[0]
@@ -194,8 +195,8 @@ class Strike:
 
 @compiled
 def _strike_all(
-    loop: Ready,
-    hand: Following,
+    loop: LoopRecords,
+    hand: ReferentInputs,
     walls: Array,
     rows: NDArray[np.void],
     found: NDArray[np.void],
@@ -206,23 +207,23 @@ def _strike_all(
     stiffness, damping, referent = np.empty(cycles), np.empty(cycles), np.empty(cycles)
     for i in range(len(walls)):
         stiffness[:], damping[:] = walls[i, 0], walls[i, 1]
-        done = close_on(loop, walls[i, 0], walls[i, 1], rows, signals)
+        done = simulate_wall(loop, walls[i, 0], walls[i, 1], rows, signals)
         cycle: Record = loop.cycle[0]
-        follow(hand, stiffness, damping, referent)
+        follow_referent(hand, stiffness, damping, referent)
         rendered = signals[:, loop.enabling : done]
         _judge(loop, rendered, cycle.trip, referent, walls[i, 0], found[i : i + 1])
 
 
 @compiled
 def _judge(
-    loop: Ready,
+    loop: LoopRecords,
     signals: Array,
     trip: int,
     referent: Array,
     stiffness: float,
     found: NDArray[np.void],
 ) -> None:
-    """Into found, (1,): signals, (3, n), are those of `close`, from the end of enabling on."""
+    """Into found, (1,); signals, (3, n): of `simulate_loop`, from the end of enabling on."""
     cycle: Record = loop.cycle[0]
     measure(
         signals[0],
@@ -257,7 +258,7 @@ def _leaves(cycle: Record, referent: Array) -> bool:
 def signals_over_bus(settings: Settings) -> tuple[Array, int]:
     """Render the wall of a strike through frames, on an embedded bus of its own.
 
-    Signals as those of `close`, shape (3, n), from the end of enabling on; and the trip.
+    Signals as those of `simulate_loop`, shape (3, n), from the end of enabling on; and the trip.
     """
     # A bus of its own: other threads of the process may strike at the same time.
     channel = f"{settings.bus.channel}-{threading.get_ident()}"

@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from canwall.sweep.analytic import (
+from canwall.analysis.analytic_limits import (
     CEILINGS,
     delayed_stiffness,
     passive_stiffness,

@@ -9,24 +9,24 @@ from canwall.walls.estimator import (
     MAX_DELAY,
     acting_force,
     actuation_state,
-    carry_on,
-    commit,
-    look_away,
-    observe,
-    pick_up,
+    correct,
+    predict,
+    predict_open_loop,
     reset_estimator,
+    restart_estimate,
     set_estimator,
+    start_open_loop,
 )
 from canwall.walls.interface import (
     HORIZON,
     WALL,
     call_law,
-    forget,
+    clear_memory,
     law,
     set_plant,
     set_referent,
 )
-from canwall.walls.layers import TENSION, note_force, wall_force
+from canwall.walls.layers import TENSION, set_applied_force, wall_force
 from canwall.walls.registry import DEADBEAT, LAWS, Law, UnknownLawError, find_law
 
 __all__ = [
@@ -42,18 +42,18 @@ __all__ = [
     "acting_force",
     "actuation_state",
     "call_law",
-    "carry_on",
-    "commit",
+    "clear_memory",
+    "correct",
     "find_law",
-    "forget",
     "law",
-    "look_away",
-    "note_force",
-    "observe",
-    "pick_up",
+    "predict",
+    "predict_open_loop",
     "reset_estimator",
+    "restart_estimate",
+    "set_applied_force",
     "set_estimator",
     "set_plant",
     "set_referent",
+    "start_open_loop",
     "wall_force",
 ]

@@ -6,7 +6,7 @@ from canwall.walls.interface import law
 
 @law
 def damped(wall: Record) -> float:
-    """f = −K·y[j] − B·ẏ[j] while the sample is inside."""
+    """F = −K·y[j] − B·ẏ[j] while the sample is inside."""
     if wall.y_sample >= 0.0:
         return 0.0
     return -wall.stiffness * wall.y_sample - wall.damping * wall.v_sample

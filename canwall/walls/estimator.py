@@ -1,4 +1,4 @@
-"""State at the instant of actuation: a Kalman filter on [y, ẏ, d] and the committed forces.
+"""State at the instant of actuation: a Kalman filter on [y, ẏ, d] and the in_flight forces.
 
 Between the sample y[j] and the moment at which the force computed from it takes effect lie D
 periods, and all forces of that time are already on their way. So the state at that moment is no
@@ -34,12 +34,12 @@ ESTIMATOR = np.dtype(
         ("full", _HOLD, (1,)),
         ("before", _HOLD, (1,)),
         ("after", _HOLD, (1,)),
-        # The state as it would be had the samples since `look_away` not been seen.
-        ("unseen_y", "f8"),
-        ("unseen_v", "f8"),
-        ("unseen_d", "f8"),
-        # The last forces, newest first: committed[0] was computed one sample ago.
-        ("committed", "f8", (MAX_DELAY + 1,)),
+        # The state as it would be had the samples since `start_open_loop` not been seen.
+        ("open_loop_y", "f8"),
+        ("open_loop_v", "f8"),
+        ("open_loop_d", "f8"),
+        # The last forces, newest first: in_flight[0] was computed one sample ago.
+        ("in_flight", "f8", (MAX_DELAY + 1,)),
     ],
     align=True,
 )
@@ -104,7 +104,7 @@ def reset_estimator(estimator: NDArray[np.void], y: float) -> None:
     """Start at rest at y, with no force known to act."""
     estimator["y"] = y
     estimator["v"] = estimator["d"] = 0.0
-    estimator["committed"] = 0.0
+    estimator["in_flight"] = 0.0
 
 
 @compiled
@@ -124,7 +124,7 @@ def _hold(
 
 
 @compiled
-def observe(estimator: Record, y_sample: float) -> None:
+def correct(estimator: Record, y_sample: float) -> None:
     """Correct the state with the sample y[j]: x̂[j|j] = x̂[j|j−1] + L·(y[j] − ŷ[j|j−1])."""
     innovation = y_sample - estimator.y
     estimator.y += estimator.gain[0] * innovation
@@ -133,7 +133,7 @@ def observe(estimator: Record, y_sample: float) -> None:
 
 
 @compiled
-def pick_up(estimator: Record, y: float, v: float) -> None:
+def restart_estimate(estimator: Record, y: float, v: float) -> None:
     """Begin again at a sample after a time without any, with the mean velocity of that time.
 
     The steady-state gain holds for one period between two samples: after many it would make a
@@ -152,10 +152,10 @@ def actuation_state(estimator: Record) -> tuple[float, float]:
         estimator.before[0],
         estimator.y,
         estimator.v,
-        estimator.committed[n] + estimator.d,
+        estimator.in_flight[n] + estimator.d,
     )
     for age in range(n - 1, -1, -1):
-        y, v = _hold(estimator, estimator.full[0], y, v, estimator.committed[age] + estimator.d)
+        y, v = _hold(estimator, estimator.full[0], y, v, estimator.in_flight[age] + estimator.d)
     return y, v
 
 
@@ -165,44 +165,44 @@ def _over_period(
 ) -> tuple[float, float]:
     """State at the next sample, by the forces on their way, of which `force` is the newest."""
     n = estimator.delay_periods
-    y, v = _hold(estimator, estimator.before[0], y, v, estimator.committed[n] + d)
-    later = force if n == 0 else estimator.committed[n - 1]
+    y, v = _hold(estimator, estimator.before[0], y, v, estimator.in_flight[n] + d)
+    later = force if n == 0 else estimator.in_flight[n - 1]
     return _hold(estimator, estimator.after[0], y, v, later + d)
 
 
 @compiled
-def commit(estimator: Record, force: float) -> None:
+def predict(estimator: Record, force: float) -> None:
     """Take note of the force on its way, and bring the state to the next sample, x̂[j+1|j].
 
     `force` is what the drive will apply: after saturation and after rounding to its unit.
     """
     estimator.y, estimator.v = _over_period(estimator, estimator.y, estimator.v, estimator.d, force)
     for age in range(MAX_DELAY, 0, -1):
-        estimator.committed[age] = estimator.committed[age - 1]
-    estimator.committed[0] = force
+        estimator.in_flight[age] = estimator.in_flight[age - 1]
+    estimator.in_flight[0] = force
 
 
 @compiled
-def look_away(estimator: Record) -> None:
+def start_open_loop(estimator: Record) -> None:
     """Keep the state before this sample and those that follow are observed."""
-    estimator.unseen_y, estimator.unseen_v = estimator.y, estimator.v
-    estimator.unseen_d = estimator.d
+    estimator.open_loop_y, estimator.open_loop_v = estimator.y, estimator.v
+    estimator.open_loop_d = estimator.d
 
 
 @compiled
-def carry_on(estimator: Record, force: float) -> None:
-    """Bring the state of `look_away` to the next sample, by the forces alone; before `commit`."""
-    estimator.unseen_y, estimator.unseen_v = _over_period(
-        estimator, estimator.unseen_y, estimator.unseen_v, estimator.unseen_d, force
+def predict_open_loop(estimator: Record, force: float) -> None:
+    """Predict the open-loop state at the next sample, by the forces alone; before `predict`."""
+    estimator.open_loop_y, estimator.open_loop_v = _over_period(
+        estimator, estimator.open_loop_y, estimator.open_loop_v, estimator.open_loop_d, force
     )
 
 
 @compiled
 def acting_force(estimator: Record) -> float:
-    """Mean of the force from this sample to the next, of those committed; after `commit`."""
+    """Mean of the force from this sample to the next, of those in_flight; after `predict`."""
     n = estimator.delay_periods
     share = estimator.before[0].duration / estimator.full[0].duration
-    force = estimator.committed[n]
+    force = estimator.in_flight[n]
     if share > 0.0:
-        force = share * estimator.committed[n + 1] + (1.0 - share) * force
+        force = share * estimator.in_flight[n + 1] + (1.0 - share) * force
     return force

@@ -18,7 +18,7 @@ _LARGEST_EXPONENT = 50.0
 
 @law
 def exponential(wall: Record) -> float:
-    """f = K·L·(exp(−y[j]/L) − 1) while the sample is inside."""
+    """F = K·L·(exp(−y[j]/L) − 1) while the sample is inside."""
     if wall.y_sample >= 0.0:
         return 0.0
     length = wall.options[0]

@@ -31,7 +31,7 @@ def predicted_force(wall: Record) -> float:
 
 @law
 def half_sample(wall: Record) -> float:
-    """f = −K·y(T/2) − B·ẏ(T/2) of the referent while the state at actuation is inside."""
+    """F = −K·y(T/2) − B·ẏ(T/2) of the referent while the state at actuation is inside."""
     return predicted_force(wall)
 
 

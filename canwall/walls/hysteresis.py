@@ -14,7 +14,7 @@ OPTIONS = {"softening": 0.8, "release": 0.0}
 
 @law
 def hysteresis(wall: Record) -> float:
-    """f = −K·y[j] moving in, −softening·K·y[j] moving out, 0 above −release moving out."""
+    """F = −K·y[j] moving in, −softening·K·y[j] moving out, 0 above −release moving out."""
     if wall.y_sample >= 0.0:
         return 0.0
     if wall.v_sample <= 0.0:

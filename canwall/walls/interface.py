@@ -111,7 +111,7 @@ def set_referent(
     wall["options"][0, : len(options)] = options
 
 
-def forget(wall: NDArray[np.void]) -> None:
+def clear_memory(wall: NDArray[np.void]) -> None:
     """Clear what law and layers remember: another law takes over."""
     for name in ("memory", "plan", "absorbed", "force_before"):
         wall[name] = 0.0

@@ -29,7 +29,7 @@ def wall_force(address: int, wall: Record) -> float:
 
 
 @compiled
-def note_force(wall: Record, force: float) -> None:
+def set_applied_force(wall: Record, force: float) -> None:
     """Take note of the force that will be applied: after saturation and rounding."""
     wall.y_before = wall.y
     wall.force_before = force

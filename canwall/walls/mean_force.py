@@ -22,6 +22,6 @@ def force_over_interval(wall: Record, y: float, v: float) -> tuple[float, float,
 
 @law
 def mean_force(wall: Record) -> float:
-    """f = (v_ref(T) − (Φ·x)_v)/Γ_v − d, where the continuous wall acts within the interval."""
+    """F = (v_ref(T) − (Φ·x)_v)/Γ_v − d, where the continuous wall acts within the interval."""
     force, _, _ = force_over_interval(wall, wall.y, wall.v)
     return force

@@ -10,7 +10,7 @@ from canwall.walls.interface import law
 
 @law
 def midpoint(wall: Record) -> float:
-    """f = −K·(y + ẏ·T/2) − B·ẏ while the state at actuation is inside."""
+    """F = −K·(y + ẏ·T/2) − B·ẏ while the state at actuation is inside."""
     if wall.y >= 0.0:
         return 0.0
     return -wall.stiffness * (wall.y + 0.5 * wall.period * wall.v) - wall.damping * wall.v

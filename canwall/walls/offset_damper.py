@@ -14,7 +14,7 @@ OPTIONS = {"offset": -0.002}
 
 @law
 def offset_damper(wall: Record) -> float:
-    """f = −K·y[j] inside, −B·ẏ[j] below the offset."""
+    """F = −K·y[j] inside, −B·ẏ[j] below the offset."""
     force = spring(wall)
     if wall.y_sample < wall.options[0]:
         force -= wall.damping * wall.v_sample

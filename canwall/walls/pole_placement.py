@@ -15,7 +15,7 @@ from canwall.walls.interface import law
 
 @compiled
 def placing_gains(wall: Record) -> tuple[float, float]:
-    """k of f = −k·x, from Ackermann's formula k = [0 1]·[Γ ΦΓ]⁻¹·p(Φ)."""
+    """K of f = −k·x, from Ackermann's formula k = [0 1]·[Γ ΦΓ]⁻¹·p(Φ)."""
     period = wall.period
     own_damping, own_stiffness = wall.viscous / wall.mass, wall.spring / wall.mass
     damping = own_damping + wall.damping / wall.mass
@@ -50,7 +50,7 @@ def placed_force(wall: Record) -> float:
 
 @law
 def pole_placement(wall: Record) -> float:
-    """f = −K·y_eq − k·(x − x_eq) while the state at actuation is inside."""
+    """F = −K·y_eq − k·(x − x_eq) while the state at actuation is inside."""
     return placed_force(wall)
 
 

@@ -35,7 +35,7 @@ def _velocity_after_impact(wall: Record) -> float:
 
 @law
 def rigid(wall: Record) -> float:
-    """f = (v_ref(T) − (Φ·x)_v)/Γ_v − d ≥ 0 of the stop."""
+    """F = (v_ref(T) − (Φ·x)_v)/Γ_v − d ≥ 0 of the stop."""
     y_free, v_free = free_step(wall, wall.y, wall.v, 0.0)
     if wall.y >= 0.0:
         if y_free >= 0.0:

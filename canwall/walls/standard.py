@@ -12,5 +12,5 @@ def spring(wall: Record) -> float:
 
 @law
 def standard(wall: Record) -> float:
-    """f = −K·y[j] while the sample is inside."""
+    """F = −K·y[j] while the sample is inside."""
     return spring(wall)

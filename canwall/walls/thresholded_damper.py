@@ -13,7 +13,7 @@ OPTIONS = {"threshold": 0.1}
 
 @law
 def thresholded_damper(wall: Record) -> float:
-    """f = −K·y[j] − B·(ẏ[j] beyond ±threshold) while the sample is inside."""
+    """F = −K·y[j] − B·(ẏ[j] beyond ±threshold) while the sample is inside."""
     if wall.y_sample >= 0.0:
         return 0.0
     threshold = wall.options[0]

@@ -9,7 +9,7 @@ from canwall.walls.interface import law
 
 @law
 def unidirectional_damper(wall: Record) -> float:
-    """f = −K·y[j] − B·min(ẏ[j], 0) while the sample is inside."""
+    """F = −K·y[j] − B·min(ẏ[j], 0) while the sample is inside."""
     if wall.y_sample >= 0.0:
         return 0.0
     return -wall.stiffness * wall.y_sample - wall.damping * min(wall.v_sample, 0.0)

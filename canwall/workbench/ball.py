@@ -21,7 +21,7 @@ from canwall.walls import (
     WALL,
     Law,
     find_law,
-    note_force,
+    set_applied_force,
     set_plant,
     set_referent,
     wall_force,
@@ -147,7 +147,7 @@ def bounce(walls: NDArray[np.void], address: int, y: float, v: float, trajectory
         wall.v = v
         wall.v_sample = v if j == 0 else (y - y_before) / wall.period
         force = wall_force(address, wall)
-        note_force(wall, force)
+        set_applied_force(wall, force)
         trajectory[0, j] = y
         trajectory[1, j] = v
         trajectory[2, j] = force

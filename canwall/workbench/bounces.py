@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from canwall import metrics
+from canwall.analysis import metrics
 from canwall.physics import flow, zoh
 from canwall.workbench.ball import CONTINUOUS, Ball, bounced
 
@@ -91,7 +91,7 @@ class Bounces:
 
 
 def continuous_between(ball: Ball, points: int) -> Array:
-    """y of the ball on the continuous floor, at the instants of `Bounces.between`."""
+    """Y of the ball on the continuous floor, at the instants of `Bounces.between`."""
     fine = replace(ball, period=ball.period / points, periods=ball.periods * points)
     return bounced(fine, CONTINUOUS)[0]
 

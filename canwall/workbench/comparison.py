@@ -13,11 +13,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
-from canwall.plots import COLOURS
+from canwall.figure_style import COLOURS
 from canwall.walls import HORIZON
 from canwall.workbench.ball import CONTINUOUS, Ball
 from canwall.workbench.bounces import Bounces, entering, over_phases
-from canwall.workbench.sheet import REFERENT, Sheet
+from canwall.workbench.figure_page import REFERENT, FigurePage
 
 Array = NDArray[np.float64]
 
@@ -75,7 +75,7 @@ GROUPS: dict[str, dict[str, Choice]] = {
 
 
 @dataclass(frozen=True)
-class Result:
+class LawResult:
     """One law at one θ, over all phases of entry.
 
     Change of ln E by a bounce (mean, least, most), largest tension and largest force [N], and
@@ -90,7 +90,7 @@ class Result:
     out: float
 
     @classmethod
-    def of(cls, strikes: list[Bounces]) -> "Result":
+    def of(cls, strikes: list[Bounces]) -> "LawResult":
         """Of the first contact of each."""
         gains = np.array([strike.gains[0] for strike in strikes if len(strike.gains)])
         forces = np.concatenate(
@@ -113,15 +113,15 @@ def floor(period: float, damping: float = 0.0) -> Ball:
     return Ball(damping=damping, period=period, periods=periods)
 
 
-def measured(law: str, choice: Choice, theta: float, phases: int) -> Result:
+def measured(law: str, choice: Choice, theta: float, phases: int) -> LawResult:
     """A law at one θ. Raises UnknownLawError."""
     ball = floor(theta, choice.damping)
-    return Result.of(list(over_phases(ball, law, ENTRY_SPEED, phases, choice.options)))
+    return LawResult.of(list(over_phases(ball, law, ENTRY_SPEED, phases, choice.options)))
 
 
-def continuous(damping: float) -> Result:
+def continuous(damping: float) -> LawResult:
     """The continuous floor, for which θ and phase are nothing."""
-    return Result.of([Bounces.on(entering(floor(1e-3, damping), ENTRY_SPEED, 0.5), CONTINUOUS)])
+    return LawResult.of([Bounces.on(entering(floor(1e-3, damping), ENTRY_SPEED, 0.5), CONTINUOUS)])
 
 
 def thetas(count: int) -> Array:
@@ -129,7 +129,7 @@ def thetas(count: int) -> Array:
     return np.geomspace(*THETA, count)
 
 
-def all_laws(count: int, phases: int) -> Iterator[Sheet]:
+def all_laws(count: int, phases: int) -> Iterator[FigurePage]:
     """The page, for so many θ and phases of entry."""
     grid = thetas(count)
     results = {
@@ -139,7 +139,7 @@ def all_laws(count: int, phases: int) -> Iterator[Sheet]:
     }
     referents = {damping: continuous(damping) for damping in (0.0, DAMPING)}
     figure = _draw(grid, results, referents)
-    yield Sheet(
+    yield FigurePage(
         "all_laws",
         "All laws: energy, tension and peak force of a bounce",
         "(no figure of its own) The standard wall puts out energy, the two new controllers hardly "
@@ -150,12 +150,12 @@ def all_laws(count: int, phases: int) -> Iterator[Sheet]:
     )
 
 
-def _values(results: list[Result], name: str) -> Array:
+def _values(results: list[LawResult], name: str) -> Array:
     return np.array([getattr(result, name) for result in results])
 
 
 def _shares(
-    name: str, results: Mapping[str, list[Result]], referents: Mapping[float, Result]
+    name: str, results: Mapping[str, list[LawResult]], referents: Mapping[float, LawResult]
 ) -> dict[str, Array]:
     """A force of each law over the peak force of the continuous wall that it renders."""
     damping = {law: choice.damping for laws in GROUPS.values() for law, choice in laws.items()}
@@ -165,7 +165,7 @@ def _shares(
 
 
 def _columns(
-    grid: Array, results: Mapping[str, list[Result]], referents: Mapping[float, Result]
+    grid: Array, results: Mapping[str, list[LawResult]], referents: Mapping[float, LawResult]
 ) -> dict[str, NDArray[np.generic]]:
     """One row for each law and θ."""
     rows = [result for of_law in results.values() for result in of_law]
@@ -182,14 +182,14 @@ def _columns(
     }
 
 
-def passive_up_to(grid: Array, results: list[Result]) -> float:
+def passive_up_to(grid: Array, results: list[LawResult]) -> float:
     """Largest θ up to which no phase of entry gains more than rounding; 0 where there is none."""
     gaining = np.flatnonzero(~(_values(results, "most") <= _ROUNDING))
     passive = grid[: gaining[0]] if len(gaining) else grid
     return float(passive[-1]) if len(passive) else 0.0
 
 
-def _finding(grid: Array, results: Mapping[str, list[Result]]) -> str:
+def _finding(grid: Array, results: Mapping[str, list[LawResult]]) -> str:
     reach = {law: passive_up_to(grid, found) for law, found in results.items()}
     always = [law for law, theta in reach.items() if theta == grid[-1]]
     partly = [f"{law} up to {theta:.2f}" for law, theta in reach.items() if 0 < theta < grid[-1]]
@@ -212,7 +212,7 @@ def _listed(items: list[str]) -> str:
 
 
 def _draw(
-    grid: Array, results: Mapping[str, list[Result]], referents: Mapping[float, Result]
+    grid: Array, results: Mapping[str, list[LawResult]], referents: Mapping[float, LawResult]
 ) -> Figure:
     figure = Figure(figsize=(13.0, 11.0), layout="constrained", dpi=120)
     grids = figure.subplots(3, len(GROUPS), sharex=True, sharey="row", squeeze=False)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from canwall.workbench.ball import CONTINUOUS
 from canwall.workbench.bounces import Bounces
-from canwall.workbench.sheet import FORCE, REFERENT, SAMPLES, Sheet, blank, legend_below
+from canwall.workbench.figure_page import FORCE, REFERENT, SAMPLES, FigurePage, blank, legend_below
 from canwall.workbench.traces import BALL, POINTS, POSITION, TIME, Traces, around, fall
 
 Array = NDArray[np.float64]
@@ -19,7 +19,7 @@ DROPS = (11.0, 13.0)
 
 def _short(
     name: str, title: str, bounces: Bounces, box: slice | None, claim: str, finding: str
-) -> Sheet:
+) -> FigurePage:
     """A few bounces beside the referent's, the close-up's part of them boxed."""
     traces = Traces.of(bounces)
     figure, axes = blank(title, TIME, POSITION)
@@ -32,12 +32,12 @@ def _short(
             Rectangle((part.t[0], low - 0.7), span, high - low + 1.4, fill=False, lw=0.9)
         )
     legend_below(figure, axes)
-    return Sheet(name, title, claim, finding, traces.columns(), figure)
+    return FigurePage(name, title, claim, finding, traces.columns(), figure)
 
 
 def _close_up(
     name: str, title: str, bounces: Bounces, contact: slice, claim: str, finding: str
-) -> Sheet:
+) -> FigurePage:
     """One contact, the samples marked; a force that pulls filled out."""
     traces = Traces.of(bounces, around(contact))
     figure, axes = blank(title, TIME, POSITION)
@@ -55,10 +55,10 @@ def _close_up(
             label="the floor pulls",
         )
     legend_below(figure, axes)
-    return Sheet(name, title, claim, finding, traces.columns(), figure)
+    return FigurePage(name, title, claim, finding, traces.columns(), figure)
 
 
-def sampled_data() -> Iterator[Sheet]:
+def sampled_data() -> Iterator[FigurePage]:
     """Figures 5.8 and 5.9."""
     bounces = fall("standard")
     contact = bounces.contacts[0]
@@ -107,7 +107,7 @@ def strongest_pull(bounces: Bounces) -> slice:
     return min(bounces.contacts, key=lambda c: float(bounces.force[c].min()))
 
 
-def half_sample() -> Iterator[Sheet]:
+def half_sample() -> Iterator[FigurePage]:
     """Figures 5.10 and 5.11."""
     bounces, standard = fall("half_sample"), fall("standard")
     contact = strongest_pull(bounces)
@@ -140,7 +140,7 @@ def half_sample() -> Iterator[Sheet]:
     )
 
 
-def long_term(seconds: float, drops: int) -> Iterator[Sheet]:
+def long_term(seconds: float, drops: int) -> Iterator[FigurePage]:
     """Figure 5.12 over that time; how typical it is from this many heights of drop."""
     bounces = fall("half_sample", seconds)
     t, y = bounces.between(POINTS)
@@ -158,7 +158,7 @@ def long_term(seconds: float, drops: int) -> Iterator[Sheet]:
         h.min() < 0.99 * h[0] and h.max() > 1.01 * h[0]
         for h in (fall("half_sample", seconds, s).heights for s in np.linspace(*DROPS, drops))
     )
-    yield Sheet(
+    yield FigurePage(
         "figure_5_12",
         title,
         "The height of the bounces is irregular, sometimes above the target, sometimes below it.",
@@ -172,7 +172,7 @@ def long_term(seconds: float, drops: int) -> Iterator[Sheet]:
     )
 
 
-def digital_design() -> Iterator[Sheet]:
+def digital_design() -> Iterator[FigurePage]:
     """Figure 5.14."""
     bounces, other = fall("pole_placement"), fall("half_sample")
     count = min(len(bounces.heights), len(other.heights))
@@ -190,7 +190,7 @@ def digital_design() -> Iterator[Sheet]:
     )
 
 
-def with_deadbeat() -> Iterator[Sheet]:
+def with_deadbeat() -> Iterator[FigurePage]:
     """Figures 5.16 and 5.17."""
     bounces = fall("half_sample+deadbeat")
     contact = strongest_pull(bounces)

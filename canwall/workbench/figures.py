@@ -6,10 +6,10 @@ from pathlib import Path
 
 import matplotlib as mpl
 
-from canwall.plots import STYLE
-from canwall.workbench import comparison, designs, origins
+from canwall.figure_style import STYLE
+from canwall.workbench import comparison, designs, energy_sources
+from canwall.workbench.figure_page import FigurePage, writing
 from canwall.workbench.on_the_drive import four_strikes
-from canwall.workbench.sheet import Sheet, writing
 from canwall.workbench.traces import BALL
 
 INDEX = "index.md"
@@ -30,9 +30,9 @@ class Extent:
 
 
 #: What draws which figures, in the order of the source.
-_FIGURES: tuple[tuple[str, Callable[[Extent], Iterator[Sheet]]], ...] = (
-    ("Figure 5.3", lambda extent: origins.tracing_out()),
-    ("Figure 5.4", lambda extent: origins.time_chart(extent.phases)),
+_FIGURES: tuple[tuple[str, Callable[[Extent], Iterator[FigurePage]]], ...] = (
+    ("Figure 5.3", lambda extent: energy_sources.tracing_out()),
+    ("Figure 5.4", lambda extent: energy_sources.time_chart(extent.phases)),
     ("Figures 5.8 and 5.9", lambda extent: designs.sampled_data()),
     ("Figures 5.10 and 5.11", lambda extent: designs.half_sample()),
     ("Figure 5.12", lambda extent: designs.long_term(extent.long_s, extent.drops)),

@@ -14,18 +14,20 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 
-from canwall import config, metrics
+from canwall import config
+from canwall.analysis import metrics
 from canwall.compiled import Record, compiled
 from canwall.config import Settings, Wall
 from canwall.cycle import make_cycle, run_laws, set_wall
 from canwall.drive import DriveSetup, PdoLayout
 from canwall.errors import RunFailedError
-from canwall.plots import COLOURS, draw_strikes
+from canwall.figure_style import COLOURS
 from canwall.record import read_signals
+from canwall.record.pictures import draw_strikes
 from canwall.run import run
 from canwall.units import DriveUnits, to_per_mille
-from canwall.walls import find_law, note_force, wall_force
-from canwall.workbench.sheet import REFERENT, Sheet, blank, legend_below, stairs
+from canwall.walls import find_law, set_applied_force, wall_force
+from canwall.workbench.figure_page import REFERENT, FigurePage, blank, legend_below, stairs
 
 Array = NDArray[np.float64]
 
@@ -59,7 +61,7 @@ def recorded_run() -> Recorded:
         return Recorded(settings, read_signals(result.folder.signals), result.summary)
 
 
-def four_strikes() -> Iterator[Sheet]:
+def four_strikes() -> Iterator[FigurePage]:
     """Both figures, from one run."""
     recorded = recorded_run()
     yield _strikes(recorded)
@@ -114,7 +116,7 @@ def _hold(
         wall.y_sample, wall.v_sample = seen[0, j], seen[1, j]
         wall.y, wall.v, wall.d = seen[2, j], seen[3, j], seen[4, j]
         held[j + 1] = to_per_mille(wall_force(address, wall), step, limit) * step
-        note_force(wall, held[j + 1])
+        set_applied_force(wall, held[j + 1])
 
 
 def meetings(t: Array, y: Array, level: Array) -> tuple[Array, int]:
@@ -133,7 +135,7 @@ def meetings(t: Array, y: Array, level: Array) -> tuple[Array, int]:
     return np.array(met), len(inside)
 
 
-def _strikes(recorded: Recorded) -> Sheet:
+def _strikes(recorded: Recorded) -> FigurePage:
     title = "Figure 5.18: four strikes of a virtual wall, with two controllers"
     figure, axes = blank(title, "time t [s]", "", (11.0, 4.8))
     strikes = recorded.summary["strikes"]
@@ -168,7 +170,7 @@ def _strikes(recorded: Recorded) -> Sheet:
         + f"{strike['energy_out_j']:.3g} J out"
         for number, strike in enumerate(strikes, start=1)
     )
-    return Sheet(
+    return FigurePage(
         "figure_5_18",
         title,
         "Four strikes on the same wall with the controllers alternating: the old one chatters, "
@@ -185,7 +187,7 @@ def _strikes(recorded: Recorded) -> Sheet:
     )
 
 
-def _efforts(recorded: Recorded) -> Sheet:
+def _efforts(recorded: Recorded) -> FigurePage:
     displayed, other = (stage.wall for stage in recorded.settings.stages[:2])
     box = close_up(recorded)
     stiffness = displayed.stiffness_nm_per_rad
@@ -202,7 +204,7 @@ def _efforts(recorded: Recorded) -> Sheet:
     legend_below(figure, axes)
     met, of = meetings(t, y, hidden)
     met_shown, of_shown = meetings(t, y, shown)
-    return Sheet(
+    return FigurePage(
         "figure_5_19",
         title,
         "With the stiffness scaled to unity, the new control effort (dashed, not displayed) meets "

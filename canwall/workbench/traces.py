@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from canwall.workbench.ball import Ball
 from canwall.workbench.bounces import Bounces, continuous_between
-from canwall.workbench.sheet import REFERENT, RENDERED, SAMPLES, stairs
+from canwall.workbench.figure_page import REFERENT, RENDERED, SAMPLES, stairs
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from canwall.walls import (
     HORIZON,
     LAWS,
     WALL,
-    forget,
+    clear_memory,
     set_plant,
     set_referent,
     wall_force,
@@ -140,7 +140,7 @@ def _planning_us(law: str, ball: Ball) -> tuple[float, int]:
     address = LAWS[law].address
     times = []
     for _ in range(_REPEATS):
-        forget(wall)
+        clear_memory(wall)
         begin = time.process_time_ns()
         periods = _first_steps(wall[0], address, ball.height, ball.speed, _STEPS)
         times.append((time.process_time_ns() - begin) / _STEPS / 1e3)

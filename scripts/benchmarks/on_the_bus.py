@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from canwall import config, simdrive
 from canwall.config import Settings
-from canwall.cycle import Axis, PythonCanExchange, run_laws, step
+from canwall.cycle import PythonCanExchange, WallAxis, run_laws, step
 from canwall.cycle.state import start_at
 from canwall.drive import REQUIRED_OBJECTS, DriveNode, DriveSetup, Link, set_up
 from canwall.eds import load_eds
@@ -100,14 +100,14 @@ class StopwatchBus(VirtualBus):
 
 
 @dataclass(frozen=True)
-class _Ready:
+class _EnabledDrive:
     """An enabled drive, and a wall to be rendered on it."""
 
     bus: StopwatchBus
     drive: simdrive.SimulatedDrive
     runner: simdrive.BusRunner
     link: Link
-    axis: Axis
+    axis: WallAxis
 
     @property
     def setup(self) -> DriveSetup:
@@ -121,7 +121,7 @@ class _Ready:
 
 
 @contextmanager
-def _ready() -> Iterator[_Ready]:
+def _ready() -> Iterator[_EnabledDrive]:
     settings = _settings(wall__law="half_sample")
     node_id = settings.drive.node_id
     channel = f"bench {next(_channels)}"
@@ -137,10 +137,10 @@ def _ready() -> Iterator[_Ready]:
         setup = set_up(node, settings.drive, settings.bus, settings.real_time)
         for controlword in (0x06, 0x07, _ENABLE_OPERATION):
             node.write(0x6040, 0, controlword)
-        axis = Axis(node, setup, settings, run_laws(settings), Ring.create())
+        axis = WallAxis(node, setup, settings, run_laws(settings), Ring.create())
         axis.cycle["phase"], axis.cycle["controlword"] = Phase.RENDERING, _ENABLE_OPERATION
         start_at(axis.cycle, node.read(0x6064))
-        yield _Ready(bus, drive, runner, link, axis)
+        yield _EnabledDrive(bus, drive, runner, link, axis)
 
 
 def exchange() -> dict[str, Any]:
@@ -215,7 +215,7 @@ def _durations_the_usual_way() -> NDArray[np.int64]:
             network.notifier.stop()
 
 
-def _checked(ready: _Ready) -> NDArray[np.int64]:
+def _checked(ready: _EnabledDrive) -> NDArray[np.int64]:
     """The durations, of a wall that was rendered to the end."""
     if ready.cycle["trip"][0] or len(ready.bus.durations_ns) != _CYCLES:
         raise RuntimeError("the wall was given up")

@@ -23,9 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall import config
+from canwall.bus.socket_pair import SocketPairBus
 from canwall.cycle import (
-    Axis,
     NativeExchange,
+    WallAxis,
     percentile_ns,
     real_time_priority,
     run_laws,
@@ -33,7 +34,6 @@ from canwall.cycle import (
     step,
 )
 from canwall.drive import DriveNode, DriveSetup, Field, Link, PdoLayout
-from canwall.pair import PairBus
 from canwall.record import ROW, Phase, Ring
 from canwall.run import drive_dictionary, make_axis, make_exchange, on_the_bus, render
 from canwall.units import DriveUnits
@@ -80,7 +80,7 @@ def _bus(sock: socket.socket) -> can.BusABC:
         # Nobody is going to read it.
         sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")
         return can.Bus(interface="socketcan", channel=sock.getsockname()[0])
-    return PairBus(sock.dup(), f"bench {next(_names)}")
+    return SocketPairBus(sock.dup(), f"bench {next(_names)}")
 
 
 @contextmanager
@@ -123,7 +123,7 @@ def _against_drive(
     return np.frombuffer(out, np.int64).reshape(-1, 2)[1:]
 
 
-def _axis(real_time: bool) -> Axis:
+def _axis(real_time: bool) -> WallAxis:
     settings = config.load(
         config.shipped("config/sim.toml"),
         {
@@ -137,7 +137,7 @@ def _axis(real_time: bool) -> Axis:
     )
     setup = DriveSetup(DriveUnits(131072.0, 0.637), 0x080, _TPDO, _RPDO)
     node = cast(DriveNode, SimpleNamespace(node_id=5, emergencies=[]))
-    axis = Axis(node, setup, settings, run_laws(settings), Ring.create())
+    axis = WallAxis(node, setup, settings, run_laws(settings), Ring.create())
     axis.cycle["phase"], axis.cycle["controlword"] = Phase.RENDERING, 0x0F
     start_at(axis.cycle, _COUNTS)
     return axis
@@ -154,7 +154,7 @@ def _c_master(program: str, awake: bool) -> Callable[[socket.socket], None]:
     return master
 
 
-def _native(real_time: bool, axis: Axis, awake: bool = True) -> Callable[[socket.socket], None]:
+def _native(real_time: bool, axis: WallAxis, awake: bool = True) -> Callable[[socket.socket], None]:
     """awake: as it comes, for the first 30 µs after the SYNC; else it waits in the kernel."""
 
     def master(sock: socket.socket) -> None:

@@ -12,8 +12,8 @@ from numba import njit
 
 from canwall import config
 from canwall.record import ROW
+from canwall.run.closed_loop import ClosedLoop, simulate_wall
 from canwall.sweep import make_plan
-from canwall.sweep.closed_loop import ClosedLoop, close_on
 from canwall.sweep.plan import Plan
 from canwall.sweep.workers import computed
 
@@ -39,11 +39,11 @@ def closed_loop() -> dict[str, Any]:
     """Periods per second and core: plant with friction, encoder, estimator, law."""
     found = {}
     for law in ("standard", "half_sample", "mean_force", "push_only"):
-        ready = ClosedLoop(_struck(law), _STRIKE).ready()
+        ready = ClosedLoop(_struck(law), _STRIKE).records()
         into = ready, 50.0, 0.0, np.zeros(1, ROW), np.empty((3, _STRIKE))
-        close_on(*into)
+        simulate_wall(*into)
         found[law] = round(
-            100 * _STRIKE / _seconds(lambda into=into: [close_on(*into) for _ in range(100)])  # type: ignore[misc]
+            100 * _STRIKE / _seconds(lambda into=into: [simulate_wall(*into) for _ in range(100)])  # type: ignore[misc]
         )
     plain = _STRIKE / _seconds(_plain_strike, 3)
     return {

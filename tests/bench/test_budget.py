@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from canwall.bench.budget import USABLE, CyclicFrame, bus_budget, frame_bits
+from canwall.bench.budget import USABLE, BudgetFrame, bus_budget, frame_bits
 
 
 def stuffed_bits(can_id: int, data: bytes) -> int:
@@ -45,9 +45,9 @@ def test_published_lengths() -> None:
 
 
 SYNC, TPDO, RPDO = (
-    CyclicFrame("SYNC", 0x080, 0),
-    CyclicFrame("TPDO", 0x185, 8),
-    CyclicFrame("RPDO", 0x205, 4),
+    BudgetFrame("SYNC", 0x080, 0),
+    BudgetFrame("TPDO", 0x185, 8),
+    BudgetFrame("RPDO", 0x205, 4),
 )
 
 
@@ -65,8 +65,8 @@ def test_one_drive_at_one_megabit() -> None:
 
 
 def test_four_drives_do_not_fit_into_a_millisecond() -> None:
-    tpdos = [CyclicFrame(f"TPDO {k}", 0x180 + k, 8) for k in (4, 3, 2, 1)]
-    rpdos = [CyclicFrame(f"RPDO {k}", 0x200 + k, 4) for k in (1, 2, 3, 4)]
+    tpdos = [BudgetFrame(f"TPDO {k}", 0x180 + k, 8) for k in (4, 3, 2, 1)]
+    rpdos = [BudgetFrame(f"RPDO {k}", 0x200 + k, 4) for k in (1, 2, 3, 4)]
     budget = bus_budget(SYNC, tpdos, rpdos, 1_000_000, 0.001)
     assert not budget.fits
     assert [line.frame.can_id for line in budget.lines[1:5]] == [0x181, 0x182, 0x183, 0x184]

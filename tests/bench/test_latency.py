@@ -14,9 +14,9 @@ from matplotlib.image import imread
 import canwall.run
 from canwall import config, simdrive
 from canwall.bench import latency as latency_module
-from canwall.bench.budget import Budget, CyclicFrame, bus_budget
-from canwall.bench.latency import Histogram, Latency, Phase, measure_latency, verdict
-from canwall.bench.latency_sheet import QUANTITIES, lines, percentiles_us, write_latency
+from canwall.bench.budget import Budget, BudgetFrame, bus_budget
+from canwall.bench.latency import Histogram, Latency, LatencyPart, measure_latency, shortest_cycle
+from canwall.bench.latency_report import QUANTITIES, lines, percentiles_us, write_latency
 from canwall.config import Settings
 from canwall.cycle import HISTOGRAM, Grant, observe_ns
 from canwall.errors import InputError, RunFailedError
@@ -111,7 +111,7 @@ def test_stopped_in_between(drives: list[Listening]) -> None:
     assert {data for can_id, data in listening.heard if can_id == 0x205} == {bytes(4)}
 
 
-# The verdict
+# The shortest_cycle
 
 
 def histogram(*values_us: float) -> Histogram:
@@ -121,14 +121,14 @@ def histogram(*values_us: float) -> Histogram:
     return Histogram.of(counted)
 
 
-def phase(name: str, sync_to_rpdo_us: float, missed: int = 0) -> Phase:
+def phase(name: str, sync_to_rpdo_us: float, missed: int = 0) -> LatencyPart:
     many = [histogram(*[value] * 1000) for value in (5.0, 10.0, sync_to_rpdo_us)]
-    return Phase(name, 1000, missed, 0, *many)
+    return LatencyPart(name, 1000, missed, 0, *many)
 
 
 def budget(settings: Settings) -> Budget:
-    frames = (CyclicFrame("TPDO", 0x185, 8),), (CyclicFrame("RPDO", 0x205, 4),)
-    sync = CyclicFrame("SYNC", 0x80, 0)
+    frames = (BudgetFrame("TPDO", 0x185, 8),), (BudgetFrame("RPDO", 0x205, 4),)
+    sync = BudgetFrame("SYNC", 0x80, 0)
     return bus_budget(sync, *frames, settings.bus.bitrate, settings.bus.cycle_s)
 
 
@@ -139,7 +139,7 @@ def bench_settings(**bus: object) -> Settings:
 
 def test_bus_that_bounds_the_cycle() -> None:
     settings = bench_settings(bitrate=125_000, cycle_s=0.005)
-    found = verdict([phase("idle", 200.0)], budget(settings), settings, GRANTED)
+    found = shortest_cycle([phase("idle", 200.0)], budget(settings), settings, GRANTED)
     # 55 + 135 + 95 bits at worst, of which 80 % of the bus may be used.
     bits = 55 + 135 + 95
     assert budget(settings).bits == bits
@@ -152,7 +152,7 @@ def test_bus_that_bounds_the_cycle() -> None:
 def test_machine_that_bounds_the_cycle() -> None:
     settings = bench_settings()
     parts = [phase("idle", 100.0), phase("load", 700.0)]
-    found = verdict(
+    found = shortest_cycle(
         parts, budget(settings), settings, {"scheduling": Grant("no real-time priority")}
     )
     assert found.by_machine_s == pytest.approx(700e-6 + 95e-6, rel=1 / 32)
@@ -163,7 +163,7 @@ def test_machine_that_bounds_the_cycle() -> None:
 def test_bus_without_a_bit_rate_has_the_time_of_a_wire_added() -> None:
     on_a_wire, without = bench_settings(), bench_settings(channel="vcan0")
     both = [
-        verdict([phase("idle", 700.0)], budget(settings), settings, GRANTED).by_machine_s
+        shortest_cycle([phase("idle", 700.0)], budget(settings), settings, GRANTED).by_machine_s
         for settings in (on_a_wire, without)
     ]
     assert both[1] - both[0] == pytest.approx((55 + 135) * 1e-6)
@@ -172,9 +172,9 @@ def test_bus_without_a_bit_rate_has_the_time_of_a_wire_added() -> None:
 def test_cycle_that_is_too_short() -> None:
     settings = bench_settings()
     parts = [phase("load", 1500.0)]
-    found = verdict(parts, budget(settings), settings, GRANTED)
+    found = shortest_cycle(parts, budget(settings), settings, GRANTED)
     assert found.text.startswith("does not hold 1 ms, but a cycle of 1.")
-    missing = verdict([phase("idle", 100.0, missed=20)], budget(settings), settings, GRANTED)
+    missing = shortest_cycle([phase("idle", 100.0, missed=20)], budget(settings), settings, GRANTED)
     assert missing.holds_s == math.inf
     assert missing.text.startswith("not even bus.cycle_s = 0.001 is held: 2.00% of the TPDOs")
 
@@ -185,7 +185,7 @@ def test_cycle_that_is_too_short() -> None:
 def measured() -> Latency:
     settings = bench_settings()
     counted = [
-        Phase(
+        LatencyPart(
             name,
             4,
             0,
@@ -197,7 +197,7 @@ def measured() -> Latency:
         for name, worst in (("idle", 4.0), ("load", 300.0))
     ]
     known = budget(settings)
-    found = verdict(counted, known, settings, GRANTED)
+    found = shortest_cycle(counted, known, settings, GRANTED)
     return Latency(
         "socketcan",
         "can0",
@@ -238,7 +238,7 @@ def test_files(tmp_path: Path) -> None:
     paths = write_latency(found, tmp_path / "out")
     assert [path.name for path in paths] == ["latency.json", "latency.csv", "latency.png"]
     numbers = json.loads(paths[0].read_text())
-    assert numbers["verdict"] == found.verdict.text
+    assert numbers["verdict"] == found.shortest_cycle.text
     assert numbers["phases"]["load"]["rpdo_margin_us"]["min"] == -200.0
     with paths[1].open() as file:
         rows = list(csv.DictReader(file))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rig import RPDO1, SDO_REQUEST, SYNC, TPDO1, Loop, Rig, RigFactory, lack, settings_with
 
 from canwall.config import Settings
-from canwall.cycle import Change, Outcome
+from canwall.cycle import Outcome, WallStage
 from canwall.cycle import exchange as exchange_module
 from canwall.record import Phase
 
@@ -169,9 +169,9 @@ def test_changes_take_effect_at_their_cycle(make_rig: RigFactory) -> None:
     loop = Loop(rig)
     wall, limits = rig.settings.wall, rig.settings.limits
     changes = [
-        Change(300, wall.model_copy(update={"law": "half_sample"}), limits),
-        Change(310, wall.model_copy(update={"stiffness_nm_per_rad": 20.0}), limits),
-        Change(310, wall.model_copy(update={"position_rad": -0.01}), limits),
+        WallStage(300, wall.model_copy(update={"law": "half_sample"}), limits),
+        WallStage(310, wall.model_copy(update={"stiffness_nm_per_rad": 20.0}), limits),
+        WallStage(310, wall.model_copy(update={"position_rad": -0.01}), limits),
     ]
     loop.run(400, changes=changes)
     rows = loop.rows()
@@ -347,7 +347,7 @@ def test_emergency_that_is_only_to_be_noted(make_rig: RigFactory) -> None:
 
     outcome = loop.run(PRESSING + 20, warn)
     assert outcome.trips == []
-    assert loop.watch.notes == ["node 5: cycle 500: EMCY 0x4210 (Temperature), register 0x08"]
+    assert loop.monitor.notes == ["node 5: cycle 500: EMCY 0x4210 (Temperature), register 0x08"]
 
 
 def test_torque_is_zero_in_the_cycle_of_the_emergency(make_rig: RigFactory) -> None:
@@ -403,7 +403,7 @@ def test_error_frames_are_counted_and_bus_off_ends_the_run(make_rig: RigFactory)
     assert trip.endswith("the adapter is bus-off: look at bit rate, cable and termination")
     assert outcome.trip_cycle is not None
     assert PRESSING <= outcome.trip_cycle <= PRESSING + 1  # in the cycle that hears of it
-    assert loop.watch.error_frames == 3
+    assert loop.monitor.error_frames == 3
 
 
 def test_drive_that_falls_silent(make_rig: RigFactory) -> None:

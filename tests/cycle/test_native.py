@@ -13,11 +13,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rig import RPDO1, TPDO1, Loop, RigFactory, settings_with
 
+from canwall.bus.cycle_socket import CycleSocket
+from canwall.bus.socket_pair import SocketPairBus
 from canwall.config import Settings
 from canwall.cycle import NativeExchange
-from canwall.cycle.cyclic_socket import CyclicSocket
 from canwall.cycle.native_cycle import next_deadline
-from canwall.pair import PairBus
 from canwall.record import TIMING_COLUMNS, Phase
 
 PRESSING = 500
@@ -178,7 +178,7 @@ def test_rpdo_that_the_other_end_does_not_take(make_rig: RigFactory) -> None:
     def deaf_after_sync(can_id: int, data: bytes) -> list[tuple[int, bytes]]:
         frames = answer(can_id, data)
         if can_id == 0x080 and loop.record["j"][0] == PRESSING:
-            assert isinstance(rig.drive_bus, PairBus)
+            assert isinstance(rig.drive_bus, SocketPairBus)
             other_end = socket.socket(fileno=os.dup(rig.drive_bus.fileno()))
             other_end.shutdown(socket.SHUT_RD)
             other_end.close()
@@ -200,4 +200,4 @@ def test_bus_without_a_descriptor(make_rig: RigFactory) -> None:
         can.Bus(interface="virtual", channel="no descriptor") as bus,
         pytest.raises(can.CanInitializationError, match=r"bus\.exchange = 'python-can'"),
     ):
-        CyclicSocket(bus, [TPDO1], [RPDO1])
+        CycleSocket(bus, [TPDO1], [RPDO1])

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from rig import Loop, RigFactory, settings_with
 from test_step import Wall
 
-from canwall.cycle import Change
+from canwall.cycle import WallStage
 from canwall.cycle.state import fade_in, fade_over, set_limits, set_wall, start_at
 from canwall.record import Phase
 
@@ -88,7 +88,7 @@ def test_change_in_a_contact_is_bumpless_on_the_bus(
     rig = make_rig(settings_with(calm))
     loop = Loop(rig)
     wall = rig.settings.wall.model_copy(update=update)
-    loop.run(PRESSING + 150, changes=[Change(PRESSING, wall, rig.settings.limits)])
+    loop.run(PRESSING + 150, changes=[WallStage(PRESSING, wall, rig.settings.limits)])
     rows = loop.rows()
     torque = rows["torque_cmd_per_mille"]
     before = np.abs(np.diff(torque[PRESSING - 50 : PRESSING])).max()
@@ -104,8 +104,10 @@ def test_changes_wait_for_the_one_before(make_rig: RigFactory) -> None:
     loop.run(
         PRESSING + 200,
         changes=[
-            Change(PRESSING, wall.model_copy(update={"stiffness_nm_per_rad": 60.0}), limits),
-            Change(PRESSING + 10, wall.model_copy(update={"stiffness_nm_per_rad": 70.0}), limits),
+            WallStage(PRESSING, wall.model_copy(update={"stiffness_nm_per_rad": 60.0}), limits),
+            WallStage(
+                PRESSING + 10, wall.model_copy(update={"stiffness_nm_per_rad": 70.0}), limits
+            ),
         ],
     )
     stiffness = loop.rows()["stiffness"]

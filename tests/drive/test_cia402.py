@@ -3,7 +3,7 @@
 import pytest
 from rig import Rig, RigFactory
 
-from canwall.drive import State, controlword_down, controlword_up, state_of
+from canwall.drive import DriveState, controlword_down, controlword_up, state_of
 
 # Statusword (CiA 402-2, table of states; x: any), state, and the next controlword up and down.
 TABLE = """
@@ -34,15 +34,15 @@ def test_every_statusword_is_the_state_of_its_pattern() -> None:
 
 @pytest.mark.parametrize(("name", "up", "down"), [row[1:] for row in ROWS])
 def test_next_controlword(name: str, up: str, down: str) -> None:
-    state = State[name.replace(" ", "_")]
+    state = DriveState[name.replace(" ", "_")]
     assert controlword_up(state, previous=0x00) == int(up, 16)
     assert controlword_down(state) == int(down, 16)
 
 
 def test_fault_reset_is_a_rising_edge() -> None:
-    first = controlword_up(State.FAULT, previous=0x0F)
-    second = controlword_up(State.FAULT, previous=first)
-    third = controlword_up(State.FAULT, previous=second)
+    first = controlword_up(DriveState.FAULT, previous=0x0F)
+    second = controlword_up(DriveState.FAULT, previous=first)
+    third = controlword_up(DriveState.FAULT, previous=second)
     assert (first, second, third) == (0x80, 0x00, 0x80)
 
 

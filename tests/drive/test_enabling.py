@@ -3,7 +3,7 @@
 import pytest
 from rig import Rig, RigFactory, settings_with
 
-from canwall.drive import DriveError, Enabling, State, disable, state_of, status_text
+from canwall.drive import DriveError, DriveState, Enabling, disable, state_of, status_text
 from canwall.drive.trial import Trial
 
 HALT = 1 << 8
@@ -33,13 +33,13 @@ def test_from_every_state_that_a_predecessor_has_left(rig: Rig, start: str) -> N
         rig.node.write(0x6040, 0, word)
     rig.node.write(0x6071, 0, 300)
     trial = trial_of(rig)
-    assert state_of(rig.node.read(0x6041)) is State.SWITCH_ON_DISABLED
+    assert state_of(rig.node.read(0x6041)) is DriveState.SWITCH_ON_DISABLED
     trial.enable()
-    assert state_of(rig.node.read(0x6041)) is State.OPERATION_ENABLED
+    assert state_of(rig.node.read(0x6041)) is DriveState.OPERATION_ENABLED
     assert rig.node.read(0x6040) == 0x0F
     assert rig.node.read(0x6077) == rig.node.read(0x6071) == 0
     trial.disable()
-    assert state_of(rig.node.read(0x6041)) is State.SWITCH_ON_DISABLED
+    assert state_of(rig.node.read(0x6041)) is DriveState.SWITCH_ON_DISABLED
 
 
 def test_from_fault(rig: Rig) -> None:
@@ -47,10 +47,10 @@ def test_from_fault(rig: Rig) -> None:
     trial.enable()
     rig.node.write(0x6007, 0, 1)
     rig.node.command("PRE-OPERATIONAL")
-    while state_of(rig.node.read(0x6041)) is not State.FAULT:
+    while state_of(rig.node.read(0x6041)) is not DriveState.FAULT:
         pass
     disable(rig.node)  # the fault stays: its reset belongs to enabling
-    assert state_of(rig.node.read(0x6041)) is State.FAULT
+    assert state_of(rig.node.read(0x6041)) is DriveState.FAULT
     rig.node.command("OPERATIONAL")
     trial.enable()
 
@@ -58,7 +58,7 @@ def test_from_fault(rig: Rig) -> None:
 def test_fault_that_returns_is_given_up() -> None:
     enabling = Enabling()
     words = []
-    while not enabling.in_vain:
+    while not enabling.gave_up:
         words += [enabling.next(FAULT), enabling.next(SWITCH_ON_DISABLED)]
         assert len(words) < 20
     assert words == [0x80, 0x06] * 4
@@ -69,7 +69,7 @@ def test_fault_that_goes_is_not() -> None:
     words = [enabling.next(word) for word in (FAULT, FAULT, FAULT, SWITCH_ON_DISABLED, ENABLED)]
     # A reset acts by its edge.
     assert words == [0x80, 0x00, 0x80, 0x06, 0x0F]
-    assert not enabling.in_vain
+    assert not enabling.gave_up
 
 
 def faulty(rig: Rig, statuswords: list[int]) -> None:

@@ -5,7 +5,7 @@ import math
 import pytest
 from rig import Rig, RigFactory, lack, settings_with
 
-from canwall.drive import Beat, DriveError
+from canwall.drive import DriveError, ErrorControlFrame
 
 READ_ONLY = 0x06010002
 REAL_TIME = {"bus.pace": "real_time", "drive.wait_s": 0.0}
@@ -21,7 +21,11 @@ def rig_without(make_rig: RigFactory, *missing: int, **drive: object) -> Rig:
 def test_rpdo_event_timer_goes_first(make_rig: RigFactory) -> None:
     rig = rig_without(make_rig)
     watchdog = rig.set_up().watchdog
-    assert (watchdog.kind, watchdog.time_s, watchdog.beat) == ("RPDO event timer", 0.1, None)
+    assert (watchdog.kind, watchdog.time_s, watchdog.error_control) == (
+        "RPDO event timer",
+        0.1,
+        None,
+    )
     assert watchdog.period_s == math.inf
     assert rig.node.read(0x1400, 5) == 100
     assert rig.node.read(0x1400, 1) == 0x205  # on again
@@ -31,7 +35,7 @@ def test_then_the_consumer_heartbeat(make_rig: RigFactory) -> None:
     rig = rig_without(make_rig, 0x1400, watchdog_s=0.06)
     watchdog = rig.set_up().watchdog
     assert (watchdog.kind, watchdog.time_s) == ("consumer heartbeat", 0.06)
-    assert watchdog.beat == Beat(0x77F, b"\x05")
+    assert watchdog.error_control == ErrorControlFrame(0x77F, b"\x05")
     assert watchdog.period_s == pytest.approx(0.02)
     assert rig.node.read(0x1016, 1) == 0x7F003C
     assert watchdog.passed_over == ("RPDO event timer: no 0x1400:05",)
@@ -56,7 +60,10 @@ def test_then_life_guarding(make_rig: RigFactory) -> None:
     rig = rig_without(make_rig, 0x1400, 0x1016)
     rig.node.write(0x1017, 0, 50)  # who sends heartbeats is not guarded
     watchdog = rig.set_up().watchdog
-    assert (watchdog.kind, watchdog.beat) == ("life guarding", Beat(0x705, remote=True))
+    assert (watchdog.kind, watchdog.error_control) == (
+        "life guarding",
+        ErrorControlFrame(0x705, remote=True),
+    )
     assert watchdog.time_s == pytest.approx(0.102)
     assert watchdog.period_s == pytest.approx(0.034)
     assert [rig.node.read(i) for i in (0x100C, 0x100D, 0x1017)] == [34, 3, 0]

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from two_bodies import Handle, Log, at, integrate, moved
 
-from canwall.physics import Force, Grasp, Hand
+from canwall.physics import Force, Grasp, HandBody
 
 STILL = Force(0.0, 0.0, 0.0, 0.0)
 BOUNDED = settings(derandomize=True, deadline=None, max_examples=100)
@@ -18,7 +18,7 @@ def constant(value: float) -> Force:
     return Force(value, 0.0, 0.0, 0.0)
 
 
-def energy(handle: Handle, hand: Hand, now: Grasp) -> float:
+def energy(handle: Handle, hand: HandBody, now: Grasp) -> float:
     kinetic = 0.5 * handle.mass * now.v**2 + 0.5 * hand.mass * now.hand_v**2
     return kinetic + 0.5 * hand.spring * now.hand_y**2 + handle.cog_energy(now.y)
 
@@ -26,7 +26,7 @@ def energy(handle: Handle, hand: Hand, now: Grasp) -> float:
 CASES = {
     "a hand that is drawn back": (
         Handle(1.0, 0.3, 0.05),
-        Hand(0.6, 0.2, 8.0, -1.0),
+        HandBody(0.6, 0.2, 8.0, -1.0),
         Grasp(0.0, 0.0, 0.0, 0.0, True),
         STILL,
         Force(-0.6, 1.0, 0.0, 0.0),
@@ -34,7 +34,7 @@ CASES = {
     ),
     "thrown off and caught": (
         Handle(1.0, 0.1, 0.02),
-        Hand(0.4, 0.3, 20.0, -1.0),
+        HandBody(0.4, 0.3, 20.0, -1.0),
         Grasp(0.1, -1.0, 0.1, -1.0, True),
         Force(3.0, -2.0, 0.0, 0.0),
         constant(-1.0),
@@ -42,7 +42,7 @@ CASES = {
     ),
     "a motor torque with a lag": (
         Handle(0.5, 0.05, 0.1),
-        Hand(0.7, 0.1, 5.0, 1.0),
+        HandBody(0.7, 0.1, 5.0, 1.0),
         Grasp(0.0, 0.0, 0.0, 0.0, True),
         Force(-1.0, 0.2, -2.5, 8.0),
         Force(0.4, 0.1, 0.0, 0.0),
@@ -50,7 +50,7 @@ CASES = {
     ),
     "over cogs": (
         Handle(1.0, 0.2, 0.05, 0.4, 0.3),
-        Hand(0.6, 0.3, 3.0, -1.0),
+        HandBody(0.6, 0.3, 3.0, -1.0),
         Grasp(0.5, -0.4, 0.9, -1.5, False),
         Force(0.3, -0.3, 1.0, 5.0),
         Force(-0.5, 0.3, 0.0, 0.0),
@@ -58,7 +58,7 @@ CASES = {
     ),
     "over cogs without friction": (
         Handle(1.0, 0.0, 0.0, 0.4, 0.3),
-        Hand(0.6, 0.0, 9.0, -1.0),
+        HandBody(0.6, 0.0, 9.0, -1.0),
         Grasp(0.02, 0.0, 0.9, -1.5, False),
         STILL,
         constant(-0.5),
@@ -66,7 +66,7 @@ CASES = {
     ),
     "a handle that is stuck is struck": (
         Handle(1.0, 0.0, 0.8),
-        Hand(0.6, 0.1, 4.0, -1.0),
+        HandBody(0.6, 0.1, 4.0, -1.0),
         Grasp(0.0, 0.0, 1.0, 0.0, False),
         constant(0.3),
         STILL,
@@ -87,7 +87,7 @@ def test_as_the_event_search_finds_it(case: str) -> None:
 
 
 @st.composite
-def motions(draw: st.DrawFn) -> tuple[Handle, Hand, Grasp, Force, Force]:
+def motions(draw: st.DrawFn) -> tuple[Handle, HandBody, Grasp, Force, Force]:
     def number(low: float, high: float) -> float:
         return draw(st.integers(round(low * 1000), round(high * 1000))) / 1000
 
@@ -95,7 +95,7 @@ def motions(draw: st.DrawFn) -> tuple[Handle, Hand, Grasp, Force, Force]:
     coulomb = draw(st.sampled_from([0.0, 0.1, 0.5]))
     handle = Handle(number(0.1, 3.0), number(0.0, 0.5), coulomb, cogging, 0.5)
     side = draw(st.sampled_from([-1.0, 1.0]))
-    hand = Hand(number(0.1, 3.0), number(0.0, 0.5), number(0.0, 9.0), side)
+    hand = HandBody(number(0.1, 3.0), number(0.0, 0.5), number(0.0, 9.0), side)
     y, v = number(-1.0, 1.0), number(-2.0, 2.0)
     if draw(st.booleans()):
         now = Grasp(y, v, y, v, True)
@@ -109,7 +109,7 @@ def motions(draw: st.DrawFn) -> tuple[Handle, Hand, Grasp, Force, Force]:
 @settings(derandomize=True, deadline=None, max_examples=200)
 @given(motions())
 def test_any_motion_is_that_of_the_event_search(
-    case: tuple[Handle, Hand, Grasp, Force, Force],
+    case: tuple[Handle, HandBody, Grasp, Force, Force],
 ) -> None:
     handle, hand, now, motor, script = case
     expected = integrate(handle, hand, now, motor, script, 1.0, 0.05)
@@ -120,7 +120,7 @@ def test_any_motion_is_that_of_the_event_search(
 @BOUNDED
 @given(motions())
 def test_the_hand_is_never_pulled_nor_beyond_the_handle(
-    case: tuple[Handle, Hand, Grasp, Force, Force],
+    case: tuple[Handle, HandBody, Grasp, Force, Force],
 ) -> None:
     """What the contact must have given the hand over a short time, by the hand's own motion."""
     handle, hand, now, motor, script = case
@@ -152,7 +152,7 @@ def test_the_hand_is_never_pulled_nor_beyond_the_handle(
 
 
 def test_an_impact_keeps_momentum_and_loses_the_energy_of_the_relative_motion() -> None:
-    handle, hand = Handle(1.3), Hand(0.7, 0.0, 0.0, -1.0)
+    handle, hand = Handle(1.3), HandBody(0.7, 0.0, 0.0, -1.0)
     v, hand_v, gap = 0.4, -1.1, 0.3
     now = moved(handle, hand, Grasp(0.0, v, gap, hand_v, False), STILL, STILL, 1.0)
     meeting = gap / (v - hand_v)
@@ -168,7 +168,7 @@ def test_an_impact_keeps_momentum_and_loses_the_energy_of_the_relative_motion() 
 def test_parts_at_the_instant_at_which_it_would_pull() -> None:
     # Both swing on the hand's spring from compression; the contact force m·ω²·(depth)·cos(ωt)
     # is that which accelerates the handle, and turns where the spring is at its rest.
-    handle, hand = Handle(1.0), Hand(3.0, 0.0, 4.0, 1.0)
+    handle, hand = Handle(1.0), HandBody(3.0, 0.0, 4.0, 1.0)
     quarter = 0.5 * math.pi
     start = Grasp(-0.2, 0.0, -0.2, 0.0, True)
     for share, touching in ((0.999999, True), (1.000001, False)):
@@ -184,7 +184,7 @@ def test_parts_at_the_instant_at_which_it_would_pull() -> None:
 @BOUNDED
 @given(motions())
 def test_neither_friction_nor_contact_makes_energy(
-    case: tuple[Handle, Hand, Grasp, Force, Force],
+    case: tuple[Handle, HandBody, Grasp, Force, Force],
 ) -> None:
     handle, hand, now, motor, script = case
     push, press = motor.constant, script.constant
@@ -200,7 +200,7 @@ def test_neither_friction_nor_contact_makes_energy(
 def test_a_hand_that_rests_on_a_handle_stays() -> None:
     handle, hand = (
         Handle(1e-4, 5e-4, 0.01, 0.003, 2.0 * math.pi / 24.0),
-        Hand(6.4e-5, 0.0256, 3.2, -1.0),
+        HandBody(6.4e-5, 0.0256, 3.2, -1.0),
     )
     now = Grasp(0.1, 0.0, 0.1, 0.0, True)
     for _ in range(20):

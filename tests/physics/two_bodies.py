@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from canwall.physics import Force, Grasp, Hand, advance_grasp, make_plant
+from canwall.physics import Force, Grasp, HandBody, advance_grasp, make_plant
 
 Array = NDArray[np.float64]
 
@@ -59,7 +59,7 @@ class Log:
 
 
 def moved(
-    handle: Handle, hand: Hand, now: Grasp, motor: Force, script: Force, duration: float
+    handle: Handle, hand: HandBody, now: Grasp, motor: Force, script: Force, duration: float
 ) -> Grasp:
     """The motion under test."""
     alone = make_plant(
@@ -94,7 +94,7 @@ def _event(function: Callable[[float, Array], float], direction: float) -> objec
 
 def integrate(
     handle: Handle,
-    hand: Hand,
+    hand: HandBody,
     now: Grasp,
     motor: Force,
     script: Force,

@@ -93,7 +93,7 @@ def happen(bench: BusBench, events: str, braking: str = "-") -> list[Moment]:
             bench.nmt(NMT_EVENTS[event])
         elif event in SUPPLIES:
             name, active = SUPPLIES[event]
-            getattr(bench.drive._axis, name)(active)
+            getattr(bench.drive._pds, name)(active)
         elif event.startswith("mode"):
             bench.write(0x6060, int(event.removeprefix("mode")))
         elif event.startswith("t"):

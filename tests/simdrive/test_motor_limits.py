@@ -126,7 +126,7 @@ def test_home_switch(enabled: MakeBench) -> None:
 def test_safe_torque_off_is_an_external_error(enabled: MakeBench) -> None:
     bench = enabled(Hardware())
     assert pull(bench, 500, 2)[1:] == [500]
-    bench.drive._axis.sto(True)
+    bench.drive._pds.sto(True)
     assert bench.read(0x6077) == 0
     assert bench.read(0x60FD) == 8
     assert bench.read(0x603F) == 0x9000
@@ -138,11 +138,11 @@ def test_undervoltage_without_operation_is_an_error_that_goes(enabled: MakeBench
     bench = enabled(Hardware(dc_link_v=24.0))
     bench.write(0x6040, 0)
     assert bench.read(0x6079) == 24000
-    bench.drive._axis.undervoltage(True)
+    bench.drive._pds.undervoltage(True)
     assert bench.read(0x6079) == 0
     assert not bench.read(0x6041) & VOLTAGE
     assert bench.read(0x1001) == 0x05
-    bench.drive._axis.undervoltage(False)
+    bench.drive._pds.undervoltage(False)
     bench.turn()
     assert bench.read(0x1001) == 0
     assert bench.read(0x6041) & VOLTAGE
@@ -151,7 +151,7 @@ def test_undervoltage_without_operation_is_an_error_that_goes(enabled: MakeBench
 
 def test_fault_of_an_injector(enabled: MakeBench) -> None:
     bench = enabled(Hardware())
-    bench.drive._axis.fault(0x4310, (0x2200, 0))
+    bench.drive._pds.fault(0x4310, (0x2200, 0))
     assert bench.read(0x6041) & 0x4F == 0x0F
     assert bench.read(0x1001) == 0x09
     bench.wait()

@@ -8,8 +8,7 @@ import pytest
 import xarray as xr
 from rig import settings_with
 
-from canwall.sweep import make_plan
-from canwall.sweep.analytic import (
+from canwall.analysis.analytic_limits import (
     CEILINGS,
     delayed_stiffness,
     passive_stiffness,
@@ -17,6 +16,7 @@ from canwall.sweep.analytic import (
     spectral_radius,
     stable_stiffness,
 )
+from canwall.sweep import make_plan
 from canwall.sweep.dataset import gathered
 from canwall.sweep.plan import compute
 

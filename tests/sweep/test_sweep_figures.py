@@ -11,9 +11,9 @@ from commands import command
 from matplotlib.figure import Figure
 from rig import settings_with
 
+from canwall.analysis.analytic_limits import CEILINGS, delayed_stiffness, stable_stiffness
 from canwall.errors import InputError
 from canwall.sweep import make_plan, read_sweep, sweep
-from canwall.sweep.analytic import CEILINGS, delayed_stiffness, stable_stiffness
 from canwall.sweep.figures import write_sweep_figures
 
 STRIKE: dict[str, Any] = {"speed": [1.0], "phase": [0.0, 0.5], "press": 0.3}

@@ -21,7 +21,7 @@ import canwall.record.recorder
 import canwall.record.writer
 import canwall.run.running
 from canwall import cli, config
-from canwall.drive import State, state_of
+from canwall.drive import DriveState, state_of
 
 VCAN_CONFIG = config.shipped("config/vcan.toml")
 
@@ -268,7 +268,7 @@ def statusword(bus: can.BusABC) -> int | None:
 def is_disabled(bus: can.BusABC) -> bool:
     """Whether the drive says that it gives no torque."""
     word = statusword(bus)
-    return word is not None and state_of(word) in (State.SWITCH_ON_DISABLED, State.FAULT)
+    return word is not None and state_of(word) in (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
 
 
 def _frames(bus: can.BusABC, seconds: float) -> Iterator[can.Message]:

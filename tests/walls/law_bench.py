@@ -11,7 +11,7 @@ from canwall.walls import (
     LAWS,
     TENSION,
     WALL,
-    note_force,
+    set_applied_force,
     set_plant,
     set_referent,
     wall_force,
@@ -58,7 +58,7 @@ def played(ball: Ball, wall: NDArray[np.void], law: str) -> tuple[Array, Array, 
         wall["y"], wall["v"], wall["y_sample"] = y, v, y
         forces.append(wall_force(address, wall[0]))
         books.append(float(wall["absorbed"][0]))
-        note_force(wall[0], forces[-1])
+        set_applied_force(wall[0], forces[-1])
         y, v = free_step(wall[0], y, v, forces[-1])
         states.append((y, v))
     positions, velocities = np.array(states).T

@@ -15,8 +15,8 @@ from canwall.walls import (
     ESTIMATOR,
     MAX_DELAY,
     actuation_state,
-    commit,
-    observe,
+    correct,
+    predict,
     reset_estimator,
     set_estimator,
 )
@@ -181,7 +181,7 @@ def test_state_at_actuation_is_the_committed_motion(model: Model, delay: float) 
         assert estimator["v"][0] == pytest.approx(bench.v, rel=0.0, abs=1e-9)
         y, v = actuation_state(estimator[0])
         assert (y, v) == pytest.approx(bench.at_actuation(), rel=1e-10, abs=1e-10)
-        commit(estimator[0], wanted(j))
+        predict(estimator[0], wanted(j))
         bench.step(wanted(j))
 
 
@@ -192,11 +192,11 @@ def test_finds_state_and_bias_of_a_plant_that_it_knows(model: Model, delay: floa
     estimator = make_estimator(model, delay)
     reset_estimator(estimator, 0.0)
     for j in range(700):
-        observe(estimator[0], bench.y)
+        correct(estimator[0], bench.y)
         force = wanted(j)
-        commit(estimator[0], force)
+        predict(estimator[0], force)
         bench.step(force)
-    observe(estimator[0], bench.y)
+    correct(estimator[0], bench.y)
     assert estimator["y"][0] == pytest.approx(bench.y, rel=0.0, abs=1e-9)
     assert estimator["v"][0] == pytest.approx(bench.v, rel=0.0, abs=1e-6)
     assert estimator["d"][0] == pytest.approx(-0.3, rel=1e-6)
@@ -212,7 +212,7 @@ def test_any_delay(delay: float, bias: float) -> None:
     reset_estimator(estimator, 0.0)
     estimator["d"] = bias
     for j in range(12):
-        commit(estimator[0], wanted(j))
+        predict(estimator[0], wanted(j))
         bench.step(wanted(j))
     assert actuation_state(estimator[0]) == pytest.approx(bench.at_actuation(), rel=1e-9, abs=1e-12)
 
@@ -227,7 +227,7 @@ def test_friction_of_a_sliding_handle_is_in_the_model(delay: float, v: float) ->
     estimator["v"], estimator["d"] = v, 0.004
     for j in range(100):
         assert actuation_state(estimator[0]) == pytest.approx(bench.at_actuation(), rel=1e-9)
-        commit(estimator[0], 0.1 * wanted(j))
+        predict(estimator[0], 0.1 * wanted(j))
         bench.step(0.1 * wanted(j))
     assert abs(bench.v) > 5.0
 
@@ -247,7 +247,7 @@ def test_friction_stops_but_does_not_push() -> None:
 def test_correction_is_the_gain_times_the_innovation() -> None:
     estimator = make_estimator(MODELS[1], 1.0)
     reset_estimator(estimator, 0.25)
-    observe(estimator[0], 0.26)
+    correct(estimator[0], 0.26)
     gain = gain_of(MODELS[1])
     assert estimator["y"][0] == pytest.approx(0.25 + 0.01 * gain[0], rel=1e-12)
     assert estimator["v"][0] == pytest.approx(0.01 * gain[1], rel=1e-10)
@@ -257,11 +257,11 @@ def test_correction_is_the_gain_times_the_innovation() -> None:
 def test_reset_forgets() -> None:
     estimator = make_estimator(MODELS[0], 1.6)
     for j in range(5):
-        observe(estimator[0], 0.1 * j)
-        commit(estimator[0], 1.0)
+        correct(estimator[0], 0.1 * j)
+        predict(estimator[0], 1.0)
     reset_estimator(estimator, -0.7)
     assert actuation_state(estimator[0]) == (-0.7, 0.0)
-    commit(estimator[0], 0.0)
+    predict(estimator[0], 0.0)
     assert actuation_state(estimator[0]) == (-0.7, 0.0)
 
 

@@ -7,7 +7,7 @@ import pytest
 from bouncing import Array, bounces
 from law_bench import PREDICTING, force_at, played, wall_of
 
-from canwall.walls import LAWS, note_force
+from canwall.walls import LAWS, set_applied_force
 from canwall.workbench import Ball, sampled_ball
 
 #: Each pulls now and then on this ball.
@@ -155,6 +155,6 @@ def test_noted_force_is_the_one_that_is_booked() -> None:
     wall = wall_of(ball, "midpoint")
     force = force_at(wall, "midpoint", -0.1, 0.0)
     assert force == pytest.approx(10.0)
-    note_force(wall[0], 0.25 * force)
+    set_applied_force(wall[0], 0.25 * force)
     force_at(wall, "midpoint", -0.3, 0.0)
     assert wall["absorbed"][0] == pytest.approx(0.25 * 10.0 * 0.2)

@@ -2,6 +2,7 @@
 
 from struct import Struct
 
+from canwall.bus.can_ids import EMCY
 from canwall.simdrive.communication.abort import AbortCode, AccessError
 from canwall.simdrive.communication.cob_id import (
     BIT_30,
@@ -53,7 +54,7 @@ class EmergencyProducer:
             for subindex in range(1, 255)
             if (0x1003, subindex) in dictionary
         ]
-        self._cob_id = dictionary.number(0x1014, absent=0x80 + dictionary.node_id)
+        self._cob_id = dictionary.number(0x1014, absent=EMCY + dictionary.node_id)
         self._cob_id.check = self._check_cob_id
         self.present: dict[tuple[int, Key], None] = {}
         """Errors that have not gone, in the order of their coming."""

@@ -2,9 +2,10 @@
 
 from collections.abc import Callable
 
+from canwall.bus.can_ids import ERROR_CONTROL
 from canwall.simdrive.communication.dictionary import Dictionary, Key
 from canwall.simdrive.communication.frame import NS_PER_MS, Clock, Send
-from canwall.simdrive.communication.heartbeat import ERROR_CONTROL, Report
+from canwall.simdrive.communication.heartbeat import Report
 
 _GUARD_TIME = (0x100C, 0)
 _LIFE_TIME_FACTOR: Key = (0x100D, 0)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import TypeAlias
 
+from canwall.bus.can_ids import ERROR_CONTROL
 from canwall.simdrive.communication.abort import AbortCode, AccessError
 from canwall.simdrive.communication.dictionary import Dictionary, Entry, Key
 from canwall.simdrive.communication.frame import NS_PER_MS, Clock, Send
@@ -11,7 +12,6 @@ from canwall.simdrive.communication.frame import NS_PER_MS, Clock, Send
 Report: TypeAlias = Callable[[Key], None]
 """Told of an entry by its (index, sub-index)."""
 
-ERROR_CONTROL = 0x700
 _NMT_STATE = 0x7F
 _BOOT_UP = 0
 
@@ -72,7 +72,7 @@ class HeartbeatConsumer:
         """
         self._changed = changed
         self._watches = [
-            _Watch(dictionary[0x1016, subindex], clock, lost, regained)
+            _MonitoredNode(dictionary[0x1016, subindex], clock, lost, regained)
             for subindex in range(1, 128)
             if (0x1016, subindex) in dictionary
         ]
@@ -98,7 +98,7 @@ class HeartbeatConsumer:
         for watch in self._watches:
             watch.tick()
 
-    def _check(self, watch: "_Watch", value: int) -> None:
+    def _check(self, watch: "_MonitoredNode", value: int) -> None:
         if value >> 24 or _node_id(value) > 127:
             raise AccessError(AbortCode.INVALID_VALUE)
         others = [other.entry.value for other in self._watches if other is not watch]
@@ -106,12 +106,12 @@ class HeartbeatConsumer:
         if _is_used(value) and _node_id(value) in watched:
             raise AccessError(AbortCode.INCOMPATIBLE_PARAMETER)
 
-    def _react(self, watch: "_Watch", _: int) -> None:
+    def _react(self, watch: "_MonitoredNode", _: int) -> None:
         watch.stop()
         self._changed()
 
 
-class _Watch:
+class _MonitoredNode:
     """One node under watch: bits 16 to 23 of the entry are its ID, bits 0 to 15 the time in ms."""
 
     def __init__(self, entry: Entry, clock: Clock, lost: Report, regained: Report) -> None:

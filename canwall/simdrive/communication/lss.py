@@ -4,12 +4,11 @@ from collections.abc import Callable
 from operator import eq, ge, le
 from struct import Struct
 
+from canwall.bus.can_ids import LSS_RESPONSE
 from canwall.simdrive.communication.dictionary import Dictionary
 from canwall.simdrive.communication.frame import Send
 from canwall.simdrive.communication.memory import UNCONFIGURED
 
-CAN_ID = 0x7E5
-_RESPONSE_ID = 0x7E4
 _NUMBER = Struct("<BL3x")
 _FAST_SCAN_REQUEST = Struct("<BLBBB")
 _DELAY = Struct("<xH5x")
@@ -181,4 +180,4 @@ class LssSlave:
         return _SUCCESS
 
     def _answer(self, command: int, number: int = 0) -> None:
-        self._send((_RESPONSE_ID, _NUMBER.pack(command, number)))
+        self._send((LSS_RESPONSE, _NUMBER.pack(command, number)))

@@ -3,8 +3,6 @@
 from collections.abc import Callable
 from enum import IntEnum
 
-CAN_ID = 0x000
-
 
 class NmtState(IntEnum):
     """States as a heartbeat shows them (CiA 301, 7.2.8.3.2.2); 0 is INITIALISATION."""

@@ -5,13 +5,11 @@ from dataclasses import dataclass, field
 from struct import Struct
 from typing import TypeAlias
 
+from canwall.bus.can_ids import SDO_REQUEST, SDO_RESPONSE
 from canwall.simdrive.communication.abort import AbortCode, AccessError
 from canwall.simdrive.communication.dictionary import Dictionary, Entry, Key
 from canwall.simdrive.communication.frame import NS_PER_MS, Clock, Send
 from canwall.simdrive.communication.sdo_block import BLOCK_SIZE, BlockDownload, BlockUpload
-
-_REQUEST = 0x600
-_RESPONSE = 0x580
 
 _INITIATE = Struct("<BHB4s")
 _ABORT = Struct("<BHBL")
@@ -82,9 +80,9 @@ class SdoServer:
 
     def __init__(self, dictionary: Dictionary, clock: Clock, send: Send) -> None:
         """Args: dictionary: what is read and written; clock: protocol time; send: the bus."""
-        self.can_id = _REQUEST + dictionary.node_id
+        self.can_id = SDO_REQUEST + dictionary.node_id
         """CAN-ID of the requests."""
-        self._response_id = _RESPONSE + dictionary.node_id
+        self._response_id = SDO_RESPONSE + dictionary.node_id
         self._dictionary = dictionary
         self._clock = clock
         self._send = send

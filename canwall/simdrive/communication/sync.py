@@ -2,13 +2,13 @@
 
 from collections.abc import Callable
 
+from canwall.bus.can_ids import SYNC
 from canwall.simdrive.communication.abort import AbortCode, AccessError
 from canwall.simdrive.communication.cob_id import BIT_30, CAN_ID, NOT_VALID, check_can_id
 from canwall.simdrive.communication.dictionary import Dictionary, Key
 from canwall.simdrive.communication.emcy import SYNC_LENGTH, SYNC_LOST, EmergencyProducer
 from canwall.simdrive.communication.frame import NS_PER_US, Clock
 
-_DEFAULT_CAN_ID = 0x080
 _COUNTER_OVERFLOW: Key = (0x1019, 0)
 _CYCLE_PERIOD: Key = (0x1006, 0)
 _OVERFLOW_VALUES = frozenset((0, *range(2, 241)))
@@ -42,7 +42,7 @@ class SyncConsumer:
         self._clock = clock
         self._emcy = emcy
         self._lost = lost
-        self._cob_id = dictionary.number(0x1005, absent=_DEFAULT_CAN_ID)
+        self._cob_id = dictionary.number(0x1005, absent=SYNC)
         self._period_us = dictionary.number(*_CYCLE_PERIOD, absent=0)
         self._window_us = dictionary.number(0x1007, absent=0)
         self._overflow = dictionary.number(*_COUNTER_OVERFLOW, absent=0)

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Protocol
 
-from canwall.simdrive.profile.axis import Motion
+from canwall.simdrive.profile.power_drive_system import Motion
 
 
 class Advance(Protocol):

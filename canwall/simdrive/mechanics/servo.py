@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
 from canwall.config import Simulation
-from canwall.physics import PLANT, Force, Grasp, Hand, advance, advance_grasp, make_plant
+from canwall.physics import PLANT, Force, Grasp, HandBody, advance, advance_grasp, make_plant
 
 #: Plants (the handle alone, and joined with the hand), the hand as a body of its own, the current
 #: loop, and the state: position and velocity of handle and hand, torque of the motor. SI units.
@@ -58,10 +58,12 @@ def hand_plant(simulation: Simulation) -> dict[str, float]:
     }
 
 
-def hand_body(simulation: Simulation) -> Hand:
+def hand_body(simulation: Simulation) -> HandBody:
     """The hand as a body of its own, for a hand that can lose the handle."""
     hand = simulation.hand
-    return Hand(hand.inertia_kg_m2, hand.damping_nm_s_per_rad, hand.stiffness_nm_per_rad, hand.side)
+    return HandBody(
+        hand.inertia_kg_m2, hand.damping_nm_s_per_rad, hand.stiffness_nm_per_rad, hand.side
+    )
 
 
 def make_servo(simulation: Simulation, counts_per_rev: float) -> NDArray[np.void]:
@@ -115,7 +117,7 @@ def move_servo(
             )
         servo.hand_y, servo.hand_v = servo.y, servo.v
     else:
-        hand = Hand(servo.hand_mass, servo.hand_viscous, servo.hand_spring, servo.hand_side)
+        hand = HandBody(servo.hand_mass, servo.hand_viscous, servo.hand_spring, servo.hand_side)
         now = Grasp(servo.y, servo.v, servo.hand_y, servo.hand_v, servo.touching)
         motor, script = Force(start, 0.0, excess, rate), Force(push, slope, 0.0, 0.0)
         now = advance_grasp(servo.handle[0], servo.joined[0], hand, now, motor, script, duration)

@@ -8,7 +8,7 @@ from canwall.simdrive.profile import option_codes
 from canwall.simdrive.profile.option_codes import OptionCode, Ramp
 
 
-class State(Enum):
+class PdsState(Enum):
     """The eight states; the value holds bits 0 to 3, 5 and 6 of the statusword."""
 
     NOT_READY_TO_SWITCH_ON = 0x00
@@ -34,31 +34,31 @@ class Command(Enum):
 FAULT_RESET = 0x80
 
 _TRANSITIONS = {
-    State.SWITCH_ON_DISABLED: {
-        Command.SHUTDOWN: State.READY_TO_SWITCH_ON,  # 2
+    PdsState.SWITCH_ON_DISABLED: {
+        Command.SHUTDOWN: PdsState.READY_TO_SWITCH_ON,  # 2
     },
-    State.READY_TO_SWITCH_ON: {
-        Command.DISABLE_VOLTAGE: State.SWITCH_ON_DISABLED,  # 7
-        Command.QUICK_STOP: State.SWITCH_ON_DISABLED,  # 7
-        Command.SWITCH_ON: State.SWITCHED_ON,  # 3
-        Command.ENABLE_OPERATION: State.OPERATION_ENABLED,  # 3 and 4
+    PdsState.READY_TO_SWITCH_ON: {
+        Command.DISABLE_VOLTAGE: PdsState.SWITCH_ON_DISABLED,  # 7
+        Command.QUICK_STOP: PdsState.SWITCH_ON_DISABLED,  # 7
+        Command.SWITCH_ON: PdsState.SWITCHED_ON,  # 3
+        Command.ENABLE_OPERATION: PdsState.OPERATION_ENABLED,  # 3 and 4
     },
-    State.SWITCHED_ON: {
-        Command.DISABLE_VOLTAGE: State.SWITCH_ON_DISABLED,  # 10
-        Command.QUICK_STOP: State.SWITCH_ON_DISABLED,  # 10
-        Command.SHUTDOWN: State.READY_TO_SWITCH_ON,  # 6
-        Command.ENABLE_OPERATION: State.OPERATION_ENABLED,  # 4
+    PdsState.SWITCHED_ON: {
+        Command.DISABLE_VOLTAGE: PdsState.SWITCH_ON_DISABLED,  # 10
+        Command.QUICK_STOP: PdsState.SWITCH_ON_DISABLED,  # 10
+        Command.SHUTDOWN: PdsState.READY_TO_SWITCH_ON,  # 6
+        Command.ENABLE_OPERATION: PdsState.OPERATION_ENABLED,  # 4
     },
-    State.OPERATION_ENABLED: {
-        Command.DISABLE_VOLTAGE: State.SWITCH_ON_DISABLED,  # 9
-        Command.QUICK_STOP: State.QUICK_STOP_ACTIVE,  # 11
-        Command.SHUTDOWN: State.READY_TO_SWITCH_ON,  # 8
-        Command.SWITCH_ON: State.SWITCHED_ON,  # 5
-        Command.ENABLE_OPERATION: State.OPERATION_ENABLED,  # takes a slow-down back
+    PdsState.OPERATION_ENABLED: {
+        Command.DISABLE_VOLTAGE: PdsState.SWITCH_ON_DISABLED,  # 9
+        Command.QUICK_STOP: PdsState.QUICK_STOP_ACTIVE,  # 11
+        Command.SHUTDOWN: PdsState.READY_TO_SWITCH_ON,  # 8
+        Command.SWITCH_ON: PdsState.SWITCHED_ON,  # 5
+        Command.ENABLE_OPERATION: PdsState.OPERATION_ENABLED,  # takes a slow-down back
     },
-    State.QUICK_STOP_ACTIVE: {
-        Command.DISABLE_VOLTAGE: State.SWITCH_ON_DISABLED,  # 12
-        Command.ENABLE_OPERATION: State.OPERATION_ENABLED,  # 16
+    PdsState.QUICK_STOP_ACTIVE: {
+        Command.DISABLE_VOLTAGE: PdsState.SWITCH_ON_DISABLED,  # 12
+        Command.ENABLE_OPERATION: PdsState.OPERATION_ENABLED,  # 16
     },
 }
 
@@ -99,7 +99,7 @@ class StateMachine:
         Raises:
             DictionaryError: an option code is of no use.
         """
-        self.state = State.NOT_READY_TO_SWITCH_ON
+        self.state = PdsState.NOT_READY_TO_SWITCH_ON
         self.ramp: Ramp | None = None
         """How the drive is to slow down, None: it is not to."""
         self.voltage = True
@@ -108,7 +108,7 @@ class StateMachine:
         """Whether what led to the fault is still there: it cannot be reset (transition 15)."""
         self._changed = changed
         self._at_rest = at_rest
-        self._following: State | None = None
+        self._following: PdsState | None = None
         self._last_controlword = 0
         self._quick_stop = OptionCode(dictionary, option_codes.QUICK_STOP)
         self._fault_reaction = OptionCode(dictionary, option_codes.FAULT_REACTION)
@@ -120,58 +120,58 @@ class StateMachine:
     @property
     def powered(self) -> bool:
         """Whether the drive function is on: a lost connection matters (0x6007)."""
-        return self.state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE)
+        return self.state in (PdsState.OPERATION_ENABLED, PdsState.QUICK_STOP_ACTIVE)
 
     @property
     def faulty(self) -> bool:
         """Whether the drive is in FAULT, or about to be."""
-        return self.state in (State.FAULT_REACTION_ACTIVE, State.FAULT)
+        return self.state in (PdsState.FAULT_REACTION_ACTIVE, PdsState.FAULT)
 
     @property
     def stays(self) -> bool:
         """Whether the drive is to stay in QUICK STOP ACTIVE (0x605A = 5 to 7)."""
-        return self.state is State.QUICK_STOP_ACTIVE and self._following is None
+        return self.state is PdsState.QUICK_STOP_ACTIVE and self._following is None
 
     def reset(self) -> None:
         """Transition 0: power-on or reset of the node."""
         self._last_controlword = 0
-        self._enter(State.NOT_READY_TO_SWITCH_ON)
+        self._enter(PdsState.NOT_READY_TO_SWITCH_ON)
 
     def control(self, controlword: int) -> None:
         """Obey a controlword (0x6040); commands without a transition are ignored."""
         fault_reset = controlword & ~self._last_controlword & FAULT_RESET
         self._last_controlword = controlword
-        if self.state is not State.FAULT:
+        if self.state is not PdsState.FAULT:
             command = decode(controlword)
             if command is not None:
                 self.command(command)
         elif fault_reset and not self.fault_present:
-            self._enter(State.SWITCH_ON_DISABLED)  # 15
+            self._enter(PdsState.SWITCH_ON_DISABLED)  # 15
 
     def command(self, command: Command) -> None:
         """Carry out one command, if the present state has a transition for it."""
         target = _TRANSITIONS.get(self.state, {}).get(command)
         if target is None:
             return
-        if self.state is State.OPERATION_ENABLED:
+        if self.state is PdsState.OPERATION_ENABLED:
             self._end_operation(command, target)
         elif self._ready_for(target):
             self._enter(target)
 
-    def _ready_for(self, target: State) -> bool:
+    def _ready_for(self, target: PdsState) -> bool:
         """Whether a transition that switches something on may be taken."""
-        if self.state is State.READY_TO_SWITCH_ON and target is not State.SWITCH_ON_DISABLED:
+        if self.state is PdsState.READY_TO_SWITCH_ON and target is not PdsState.SWITCH_ON_DISABLED:
             return self.voltage  # 3
-        if self.state is State.QUICK_STOP_ACTIVE and target is State.OPERATION_ENABLED:
+        if self.state is PdsState.QUICK_STOP_ACTIVE and target is PdsState.OPERATION_ENABLED:
             return self._quick_stop.stays and self._at_rest()  # 16
         return True
 
-    def _end_operation(self, command: Command, target: State) -> None:
-        if target is State.QUICK_STOP_ACTIVE:
+    def _end_operation(self, command: Command, target: PdsState) -> None:
+        if target is PdsState.QUICK_STOP_ACTIVE:
             if self._quick_stop.disables:
-                self._enter(State.SWITCH_ON_DISABLED)
+                self._enter(PdsState.SWITCH_ON_DISABLED)
             else:
-                following = None if self._quick_stop.stays else State.SWITCH_ON_DISABLED
+                following = None if self._quick_stop.stays else PdsState.SWITCH_ON_DISABLED
                 self._enter(target, self._quick_stop.ramp, following)
         elif command in self._leaving:
             if self._following is not target:
@@ -187,25 +187,25 @@ class StateMachine:
         Args:
             coasting: there is no torque to brake with.
         """
-        if self.state is State.FAULT_REACTION_ACTIVE:
+        if self.state is PdsState.FAULT_REACTION_ACTIVE:
             if coasting:
-                self._enter(self.state, Ramp.MOTOR_FREE, State.FAULT)
+                self._enter(self.state, Ramp.MOTOR_FREE, PdsState.FAULT)
         elif self._fault_reaction.disables:
-            self._enter(State.FAULT)
-        elif self.state is not State.FAULT:
+            self._enter(PdsState.FAULT)
+        elif self.state is not PdsState.FAULT:
             braking = self.powered and not coasting
             ramp = self._fault_reaction.ramp if braking else Ramp.MOTOR_FREE
-            self._enter(State.FAULT_REACTION_ACTIVE, ramp, State.FAULT)
+            self._enter(PdsState.FAULT_REACTION_ACTIVE, ramp, PdsState.FAULT)
 
     def step(self) -> None:
         """Take the automatic transition that is due: what the drive had to do is done."""
-        if self.state is State.NOT_READY_TO_SWITCH_ON:
-            self._enter(State.SWITCH_ON_DISABLED)  # 1
+        if self.state is PdsState.NOT_READY_TO_SWITCH_ON:
+            self._enter(PdsState.SWITCH_ON_DISABLED)  # 1
         elif self._following is not None and self._at_rest():
             self._enter(self._following)  # 5, 8, 12, 14
 
     def _enter(
-        self, state: State, ramp: Ramp | None = None, following: State | None = None
+        self, state: PdsState, ramp: Ramp | None = None, following: PdsState | None = None
     ) -> None:
         self.state = state
         self.ramp = ramp

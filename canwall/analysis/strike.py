@@ -1,0 +1,166 @@
+"""What is found at one point of a sweep: the metrics of theory, section 5, of one strike."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canwall.analysis import metrics
+from canwall.compiled import Record, compiled
+
+Array = NDArray[np.float64]
+
+#: One strike, judged. What cannot be told is NaN.
+MEASURES = np.dtype(
+    [
+        ("chatters", "?"),  # or threw the handle away
+        ("settled", "?"),  # whether the referent settles, so that the amplitude can be judged
+        ("trip", "i1"),  # cycle.Trip
+        ("contacts", "i4"),
+        ("events", "i4"),  # makes and breaks in the busiest 200 ms
+        ("referent_events", "i4"),
+        ("motion", "f8"),  # peak to peak about the settled contact
+        ("referent_motion", "f8"),
+        ("tolerance", "f8"),  # of that motion: what quantisation explains
+        ("amplitude", "f8"),  # half peak to peak of the chatter
+        ("frequency", "f8"),  # of the chatter
+        ("energy_out", "f8"),  # the most that the wall had put out at any time
+        ("energy_end", "f8"),  # signed area of the hysteresis loop: what it had put out at the end
+        ("energy_tolerance", "f8"),  # one count times the peak torque
+        ("peak_torque", "f8"),
+        ("penetration", "f8"),
+        ("rate_hardness", "f8"),
+        ("restitution", "f8"),  # of the first contact
+        ("referent_restitution", "f8"),
+    ],
+    align=True,
+)
+
+#: (unit, what it is) of the measures that are numbers.
+DESCRIBED = {
+    "chatters": (
+        "1",
+        "chatter by theory, section 5, or a trip where the referent stays within the limits",
+    ),
+    "settled": ("1", "the referent settles, so that the amplitude is judged"),
+    "trip": ("1", "the limit that ended the strike (cycle.Trip), 0: none"),
+    "contacts": ("1", "contacts of the strike"),
+    "events": ("1", "makes and breaks of contact within the busiest 200 ms"),
+    "referent_events": ("1", "the same of the continuous referent"),
+    "motion": ("rad", "peak to peak about the settled contact"),
+    "referent_motion": ("rad", "the same of the continuous referent"),
+    "tolerance": ("rad", "motion that quantisation explains"),
+    "amplitude": ("rad", "half peak to peak of the chatter, 0: none"),
+    "frequency": ("Hz", "frequency of the chatter, 0: none"),
+    "energy_out": ("J", "most energy that the wall had put out at any time"),
+    "energy_end": ("J", "energy that the wall had put out at the end: area of the loop f(y)"),
+    "energy_tolerance": ("J", "one encoder count times the peak torque"),
+    "peak_torque": ("N*m", "largest torque commanded"),
+    "penetration": ("rad", "deepest position inside the wall"),
+    "rate_hardness": ("N*m/rad", "initial rise of the force over the approach speed"),
+    "restitution": ("1", "speed out over speed in, first contact"),
+    "referent_restitution": ("1", "the same of the continuous referent"),
+}
+
+#: Samples over which a speed before or after a contact, and the rise of the force, are taken.
+_SPAN = 5
+
+
+@compiled
+def measure(
+    y: Array,
+    force: Array,
+    torque: Array,
+    trip: int,
+    thrown: bool,
+    referent: Array,
+    period: float,
+    count: float,
+    torque_step: float,
+    stiffness: float,
+    found: NDArray[np.void],
+) -> None:
+    """Judge one strike into found[0], dtype MEASURES.
+
+    y, force, torque and referent have shape (n,); thrown says that a trip is the wall's doing,
+    its referent's would have stayed within the limits; count is Δ [rad], torque_step f_LSB [N·m].
+    """
+    into: Record = found[0]
+    window = metrics.event_window(period)
+    tolerance = metrics.amplitude_tolerance(stiffness, count, torque_step)
+    into.trip = trip
+    into.tolerance = tolerance
+    into.events = metrics.most_events(y, window, count)
+    into.referent_events = metrics.most_events(referent, window, count)
+    start, stop = metrics.rest_of(referent, tolerance, period)
+    into.settled = stop > start
+    into.motion = metrics.peak_to_peak(y[start:stop])
+    into.referent_motion = metrics.peak_to_peak(referent[start:stop])
+    into.chatters = (
+        thrown
+        or into.events - into.referent_events >= metrics.EVENTS_OF_CHATTER
+        or into.motion - into.referent_motion > tolerance
+    )
+    first, after, contacts = _contacts(y, force)
+    into.contacts = contacts
+    into.amplitude = into.frequency = 0.0
+    if into.chatters:
+        cycle = y[start:stop] if stop > start else y[first:after]
+        into.amplitude, into.frequency = metrics.limit_cycle(cycle, period)
+    _energies(into, y, force)
+    into.peak_torque = np.abs(torque).max() if len(torque) else 0.0
+    into.energy_tolerance = count * into.peak_torque
+    into.penetration = max(-y.min(), 0.0) if len(y) else 0.0
+    speed, into.restitution = _bounce(y, period)
+    _, into.referent_restitution = _bounce(referent, period)
+    into.rate_hardness = math.nan
+    if speed < 0.0 and first + _SPAN < len(force):
+        into.rate_hardness = -(force[first + _SPAN] - force[first]) / (_SPAN * period) / speed
+
+
+@compiled
+def _contacts(y: Array, force: Array) -> tuple[int, int, int]:
+    """First cycle of contact, the one after the last, and how many contacts (`metrics`)."""
+    first = after = contacts = 0
+    touching = False
+    for j in range(len(y)):
+        touches = y[j] < 0.0 or force[j] != 0.0
+        if touches and not touching:
+            first = j if contacts == 0 else first
+            contacts += 1
+        touching = touches
+        after = j + 1 if touches else after
+    return first, after, contacts
+
+
+@compiled
+def _energies(into: Record, y: Array, force: Array) -> None:
+    """Running energy out, as `metrics.energy_out`: its largest and its last."""
+    work = most = 0.0
+    for j in range(len(y) - 1):
+        work += force[j] * (y[j + 1] - y[j])
+        most = max(most, work)
+    into.energy_out, into.energy_end = most, work
+
+
+@compiled
+def _bounce(y: Array, period: float) -> tuple[float, float]:
+    """Speed at the first contact, and how much of it is left at its end; NaN where there is none.
+
+    Mean speeds over the samples before the contact and after it.
+    """
+    enter = 0
+    while enter < len(y) and y[enter] >= 0.0:
+        enter += 1
+    if enter <= _SPAN or enter >= len(y):
+        return math.nan, math.nan
+    speed = (y[enter - 1] - y[enter - 1 - _SPAN]) / (_SPAN * period)
+    leave = enter
+    while leave < len(y) and y[leave] < 0.0:
+        leave += 1
+    if leave + _SPAN >= len(y) or not speed < 0.0:
+        return speed, math.nan
+    for j in range(leave, leave + _SPAN):
+        if y[j] < 0.0:
+            return speed, math.nan
+    return speed, -(y[leave + _SPAN] - y[leave]) / (_SPAN * period) / speed

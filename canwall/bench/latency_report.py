@@ -1,0 +1,235 @@
+"""A measured latency for people and for programs: histograms as text, picture, numbers."""
+
+import csv
+import json
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
+from numpy.typing import NDArray
+
+from canwall.bench.latency import Histogram, Latency, LatencyPart
+from canwall.errors import InputError
+from canwall.figure_style import COLOURS, STYLE
+
+#: Width of the longest bar [characters].
+_BAR = 24
+_PERCENTILES = ("p50", "p99", "p999", "max")
+
+
+class Quantity(NamedTuple):
+    """What is measured in each phase.
+
+    name: in the files. of: its histogram. margin: what is told is the cycle less this.
+    """
+
+    name: str
+    title: str
+    of: Callable[[LatencyPart], Histogram]
+    margin: bool = False
+
+
+QUANTITIES = (
+    Quantity("sync_error", "SYNC: error of its interval", lambda phase: phase.sync_error),
+    Quantity("tpdo_to_rpdo", "TPDO → RPDO", lambda phase: phase.tpdo_to_rpdo),
+    Quantity(
+        "rpdo_margin", "RPDO: margin before the next SYNC", lambda phase: phase.sync_to_rpdo, True
+    ),
+)
+
+
+def percentiles_us(latency: Latency, quantity: Quantity, phase: LatencyPart) -> dict[str, float]:
+    """p50, p99, p99.9 and max [us]; a margin: what so many cycles have at least, and the least."""
+    histogram = quantity.of(phase)
+    values = (getattr(histogram, f"{name}_us") for name in _PERCENTILES)
+    if not quantity.margin:
+        return dict(zip(("p50", "p99", "p99.9", "max"), values, strict=True))
+    period_us = latency.cycle_s * 1e6
+    return dict(
+        zip(("p50", "p99", "p99.9", "min"), (period_us - value for value in values), strict=True)
+    )
+
+
+def lines(latency: Latency) -> Iterator[str]:
+    """The histograms as text, in bins of 1, 2, 5, 10 … µs, with bars that are logarithmic."""
+    yield (
+        f"{latency.interface} {latency.channel}, cycle {latency.cycle_s * 1e3:g} ms, exchange "
+        f"{latency.exchange}; the drive is set up, not enabled, and gets zero torque"
+    )
+    yield f"load: {latency.load}"
+    for what, grant in latency.granted.items():
+        advice = f"; {grant.advice}" if grant.advice else ""
+        yield f"{what.replace('_', '-')}: {grant.found}{advice}"
+    for quantity in QUANTITIES:
+        yield ""
+        yield f"{quantity.title} [µs]"
+        yield from _bars(latency, quantity)
+        for phase in latency.phases:
+            numbers = percentiles_us(latency, quantity, phase)
+            yield f"  {phase.name:>5}: " + ", ".join(f"{k} {v:.1f}" for k, v in numbers.items())
+    yield ""
+    for phase in latency.phases:
+        yield (
+            f"{phase.name}: {phase.cycles} cycles, {phase.missed_tpdo} TPDOs missed, "
+            f"{phase.late_rpdo} RPDOs after the next SYNC"
+        )
+
+
+def _bars(latency: Latency, quantity: Quantity) -> Iterator[str]:
+    histograms = [quantity.of(phase) for phase in latency.phases]
+    edges = _edges(max(histogram.max_us for histogram in histograms))
+    binned = [_binned(histogram, edges) for histogram in histograms]
+    total = max(int(counts.sum()) for counts in binned)
+    used = np.flatnonzero(np.sum(binned, axis=0))
+    if not len(used):
+        return
+    names = "".join(f"{phase.name:<{_BAR + 10}}" for phase in latency.phases)
+    yield f"  {'':>15}  {names.rstrip()}"
+    for k in range(used[0], used[-1] + 1):
+        low, high = edges[k], edges[k + 1]
+        if quantity.margin:
+            period = latency.cycle_s * 1e6
+            low, high = period - high, period - low
+        cells = "".join(_cell(int(counts[k]), total) for counts in binned)
+        yield f"  {low:>6g} – {high:<6g}  {cells.rstrip()}"
+
+
+def _cell(count: int, total: int) -> str:
+    length = math.ceil(_BAR * math.log1p(count) / math.log1p(total)) if count else 0
+    return f"{count:>8} {'█' * length:<{_BAR}} "
+
+
+def _edges(largest_us: float) -> NDArray[np.float64]:
+    """0, 1, 2, 5, 10 … up to what has the largest value in its last bin [us]."""
+    edges = [0.0]
+    decade = 1.0
+    while True:
+        for step in (1.0, 2.0, 5.0):
+            edges.append(step * decade)
+            if step * decade >= largest_us:
+                return np.array(edges)
+        decade *= 10.0
+
+
+def _binned(histogram: Histogram, edges: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Counts between the edges, upper ones inclusive; shape (n − 1,)."""
+    places = np.searchsorted(edges[1:], np.minimum(histogram.ends_us, histogram.max_us))
+    counts = np.zeros(len(edges) - 1, np.int64)
+    np.add.at(counts, places, histogram.counts)
+    return counts
+
+
+def write_latency(latency: Latency, folder: Path) -> list[Path]:
+    """latency.json, latency.csv and latency.png into a folder; their paths.
+
+    latency.csv has every bucket: quantity, phase, up to how many µs, and how many cycles; its
+    margin is given as the time from SYNC to RPDO. Raises InputError where it cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        paths = [folder / f"latency.{ending}" for ending in ("json", "csv", "png")]
+        text = json.dumps(_numbers(latency), indent=2, ensure_ascii=False)
+        paths[0].write_text(text + "\n", encoding="utf-8")
+        with paths[1].open("w", newline="", encoding="utf-8") as file:
+            table = csv.writer(file)
+            table.writerow(("quantity", "phase", "up_to_us", "cycles"))
+            table.writerows(_buckets(latency))
+        _draw(latency, paths[2])
+    except OSError as error:
+        raise InputError(f"--output {folder}: {error.strerror}") from None
+    return paths
+
+
+def _numbers(latency: Latency) -> dict[str, Any]:
+    budget, shortest_cycle = latency.budget, latency.shortest_cycle
+    return {
+        "interface": latency.interface,
+        "channel": latency.channel,
+        "bitrate": latency.bitrate,
+        "cycle_s": latency.cycle_s,
+        "exchange": latency.exchange,
+        "machine": {name: grant.found for name, grant in latency.granted.items()},
+        "load": latency.load,
+        "phases": {
+            phase.name: {
+                "cycles": phase.cycles,
+                "missed_tpdo": phase.missed_tpdo,
+                "late_rpdo": phase.late_rpdo,
+                **{
+                    f"{quantity.name}_us": percentiles_us(latency, quantity, phase)
+                    for quantity in QUANTITIES
+                },
+            }
+            for phase in latency.phases
+        },
+        "bus": {"bits": budget.bits, "share": budget.share, "highest_hz": budget.highest_hz},
+        "holds_cycle_s": shortest_cycle.holds_s if math.isfinite(shortest_cycle.holds_s) else None,
+        "verdict": shortest_cycle.text,
+    }
+
+
+def _buckets(latency: Latency) -> Iterator[tuple[str, str, float, int]]:
+    for quantity in QUANTITIES:
+        name = "sync_to_rpdo" if quantity.margin else quantity.name
+        for phase in latency.phases:
+            histogram = quantity.of(phase)
+            for end, count in zip(histogram.ends_us, histogram.counts, strict=True):
+                yield name, phase.name, float(end), int(count)
+
+
+def _draw(latency: Latency, path: Path) -> None:
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(12, 4.2), layout="constrained", dpi=120)
+        for axes, quantity in zip(figure.subplots(1, len(QUANTITIES)), QUANTITIES, strict=True):
+            _panel(axes, latency, quantity)
+        rate = f"{latency.cycle_s * 1e3:g} ms"
+        figure.suptitle(
+            f"{latency.interface} {latency.channel}, {latency.exchange}, cycle {rate}; "
+            f"load: {latency.load}",
+            fontsize=9,
+            x=0.01,
+            ha="left",
+        )
+        figure.savefig(path)
+
+
+def _panel(axes: Axes, latency: Latency, quantity: Quantity) -> None:
+    """Cycles per tenth of an octave, idle and under load, with their p99.9."""
+    histograms = [quantity.of(phase) for phase in latency.phases]
+    known = [histogram for histogram in histograms if len(histogram.ends_us)]
+    low = max(0.1, min((histogram.ends_us[0] for histogram in known), default=0.1))
+    high = max(low, max((histogram.max_us for histogram in known), default=low))
+    # Buckets are 1/32 to 1/64 of an octave apart: a tenth of one never falls between two.
+    edges = low * 2.0 ** (np.arange(-1, math.ceil(10 * math.log2(high / low)) + 2) / 10)
+    for phase, histogram, colour in zip(
+        latency.phases, histograms, (COLOURS[1], COLOURS[0]), strict=False
+    ):
+        ends = np.clip(histogram.ends_us, edges[0], edges[-1])
+        counts, _ = np.histogram(ends, edges, weights=histogram.counts)
+        numbers = percentiles_us(latency, quantity, phase)
+        what = f"{phase.name}, margin" if quantity.margin else phase.name
+        label = f"{what}: p50 {numbers['p50']:.0f}, p99.9 {numbers['p99.9']:.0f} µs"
+        axes.stairs(counts, edges, color=colour, label=label, fill=True, alpha=0.35)
+        axes.stairs(counts, edges, color=colour)
+        axes.axvline(histogram.p999_us, color=colour, linestyle="--", linewidth=1)
+    if quantity.margin:
+        period_us = latency.cycle_s * 1e6
+        axes.axvline(period_us, color="black", linewidth=1.5, label="the next SYNC")
+        axes.set_title("SYNC due → RPDO; what is left is the margin")
+    else:
+        axes.set_title(quantity.title)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_ylim(0.7, None)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 100.0 * low else (1.0,)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_xlabel("µs (dashed: p99.9)")
+    axes.set_ylabel("cycles")
+    axes.legend(fontsize=8, frameon=True, framealpha=0.9, edgecolor="none")

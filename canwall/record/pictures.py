@@ -1,0 +1,151 @@
+"""The picture of a run, drawn from its record alone."""
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pyarrow as pa
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from canwall.figure_style import COLOURS, STYLE
+from canwall.record.folder import RunFolder, read_signals
+
+Array = NDArray[np.float64]
+
+#: Length of a close-up [s].
+_CLOSE_UP_S = 0.045
+
+
+def plot_run(folder: RunFolder) -> Path:
+    """The run at a glance, into run.png; returns its path.
+
+    Position and torque over time with the strikes marked, one contact of each law close up
+    (Figure 5.19 of the source), and force over position (Figure 5.3). Raises ConfigError where
+    the folder holds no record.
+    """
+    signals, summary = read_signals(folder.signals), folder.read_summary()
+    strikes = summary["strikes"]
+    laws = list(dict.fromkeys(strike["law"] for strike in strikes))
+    colours = dict(zip(laws, COLOURS * 4, strict=False))
+    shown = [next(s for s in strikes if s["law"] == law) for law in laws[:2]]
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(12, 9), layout="constrained", dpi=120)
+        rows = figure.add_gridspec(3, 1, height_ratios=[1.1, 0.9, 1.5])
+        over_time = figure.add_subplot(rows[0])
+        torque = figure.add_subplot(rows[1], sharex=over_time)
+        draw_strikes(over_time, signals, strikes, colours)
+        _torque(torque, signals, strikes, colours)
+        details = rows[2].subgridspec(1, max(len(shown), 1) + 1)
+        for column, strike in enumerate(shown):
+            _close_up(figure.add_subplot(details[column]), signals, strike, colours)
+        _force_over_position(figure.add_subplot(details[-1]), signals, shown, colours)
+        figure.savefig(folder.picture)
+    return folder.picture
+
+
+def _column(signals: pa.Table, name: str) -> Array:
+    return np.asarray(signals[name].to_numpy())
+
+
+def _mark_strikes(axes: Axes, strikes: list[dict[str, Any]], colours: dict[str, str]) -> None:
+    for strike in strikes:
+        axes.axvspan(
+            strike["start_s"], strike["end_s"], color=colours[strike["law"]], alpha=0.08, lw=0
+        )
+
+
+def draw_strikes(
+    axes: Axes, signals: pa.Table, strikes: list[dict[str, Any]], colours: dict[str, str]
+) -> None:
+    """Position [mrad] over time, each strike of the summary with its law and whether it chatters.
+
+    colours maps each law to its colour.
+    """
+    t, y = _column(signals, "t_s"), _column(signals, "y") * 1e3
+    axes.plot(t, y, color="0.2", lw=0.7)
+    axes.axhline(0.0, color="k", lw=0.8)
+    low, high = float(y.min(initial=0.0)), float(y.max(initial=0.0))
+    span = max(high - low, 1e-6)
+    axes.set_ylim(low - 0.05 * span, high + 0.25 * span)
+    axes.axhspan(axes.get_ylim()[0], 0.0, color="0.85", zorder=0)
+    _mark_strikes(axes, strikes, colours)
+    for strike in strikes:
+        verdict = "no chatter"
+        if strike["chatter"]:
+            verdict = f"chatter, {strike['chatter_frequency_hz']:.0f} Hz"
+        axes.text(
+            0.5 * (strike["start_s"] + strike["end_s"]),
+            high + 0.22 * span,
+            f"{strike['law']}\n{verdict}",
+            color=colours[strike["law"]],
+            ha="center",
+            va="top",
+        )
+    axes.set_ylabel("position from the wall [mrad]")
+    axes.set_title("Strikes on the wall (grey: inside)")
+    axes.tick_params(labelbottom=False)
+
+
+def _torque(
+    axes: Axes, signals: pa.Table, strikes: list[dict[str, Any]], colours: dict[str, str]
+) -> None:
+    axes.plot(
+        _column(signals, "t_s"),
+        _column(signals, "torque_applied"),
+        color="0.2",
+        lw=0.7,
+        drawstyle="steps-post",
+    )
+    _mark_strikes(axes, strikes, colours)
+    axes.margins(x=0.01)
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("torque applied [N·m]")
+
+
+def _close_up(
+    axes: Axes, signals: pa.Table, strike: dict[str, Any], colours: dict[str, str]
+) -> None:
+    t = _column(signals, "t_s")
+    start = max(strike["start_s"] - 0.1 * _CLOSE_UP_S, t[0])
+    window = (t >= start) & (t <= start + _CLOSE_UP_S)
+    milliseconds = (t[window] - strike["start_s"]) * 1e3
+    # As in the source's figure: the force in units of position, f/K, over the position it opposes.
+    opposed = -_column(signals, "y")[window] * 1e3
+    held = _column(signals, "force_applied")[window] / strike["stiffness"] * 1e3
+    colour = colours[strike["law"]]
+    axes.plot(milliseconds, opposed, ".-", color="0.3", lw=0.8, ms=3, label="penetration −y")
+    axes.step(milliseconds, held, where="post", color=colour, lw=1.2, label="force held, f/K")
+    axes.axhline(0.0, color="k", lw=0.8)
+    axes.set_xlabel("time from contact [ms]")
+    axes.set_ylabel("penetration, f/K [mrad]")
+    axes.set_title(f"First contact: {strike['law']}")
+    axes.legend()
+
+
+def _force_over_position(
+    axes: Axes, signals: pa.Table, shown: list[dict[str, Any]], colours: dict[str, str]
+) -> None:
+    t, y = _column(signals, "t_s"), _column(signals, "y") * 1e3
+    force = _column(signals, "force_applied")
+    deepest = 0.0
+    for strike in shown:
+        window = (t >= strike["start_s"]) & (t <= strike["start_s"] + _CLOSE_UP_S)
+        # Held over each period: along y at constant force, then the step to the next.
+        axes.plot(
+            np.repeat(y[window], 2)[1:],
+            np.repeat(force[window], 2)[:-1],
+            color=colours[strike["law"]],
+            lw=0.8,
+            label=strike["law"],
+        )
+        deepest = min(deepest, float(y[window].min(initial=0.0)))
+    if shown:
+        line = np.array([deepest, 0.0])
+        axes.plot(line, -shown[0]["stiffness"] * line * 1e-3, "k--", lw=1.0, label="f = −K·y")
+        axes.legend(loc="upper right")
+    axes.set_xlabel("position from the wall [mrad]")
+    axes.set_ylabel("force out of the wall [N·m]")
+    axes.set_title("Force over position, same time")

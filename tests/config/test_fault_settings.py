@@ -1,0 +1,77 @@
+"""`[[simulation.fault]]`: what is a fault, and what a configuration says that is none."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from commands import config_file
+
+from canwall.config import AMOUNTS, NUMBERS, ConfigError, load
+
+
+def file_with(tmp_path: Path, *faults: str) -> Path:
+    path = config_file(tmp_path / "faults.toml")
+    path.write_text(path.read_text() + "".join(f"\n[[simulation.fault]]\n{f}\n" for f in faults))
+    return path
+
+
+def test_faults_are_read_and_written(tmp_path: Path) -> None:
+    found = load(
+        file_with(
+            tmp_path,
+            'kind = "lost"\nat_s = 2\nduration_s = 0.5\ncan_id = 0x185\nprobability = 1',
+            'kind = "emcy"\nat_sync = 7\nduration_syncs = 3\namount = 0x8130',
+        )
+    )
+    assert found.simulation is not None
+    lost, emcy = found.simulation.fault
+    assert (lost.at_s, lost.can_id, lost.direction) == (2.0, 0x185, None)
+    assert (emcy.at_sync, emcy.amount) == (7, 0x8130)
+    again = tmp_path / "again.toml"
+    again.write_text(found.to_toml())
+    assert load(again) == found
+
+
+@pytest.mark.parametrize(
+    ("fault", "line"),
+    [
+        ('kind = "lost"\nat_s = 1.0\nat_sync = 3', "at_s and at_sync say the same; keep one"),
+        (
+            'kind = "lost"\nduration_s = 1.0\nduration_syncs = 3',
+            "duration_s and duration_syncs say the same; keep one",
+        ),
+        ('kind = "sto"\nprobability = 0.5', "probability: the kind sto has none; remove it"),
+        ('kind = "silence"\ncan_id = 5', "can_id: the kind silence has none; remove it"),
+        ('kind = "babbling"\ndirection = "sent"', "direction: the kind babbling has none"),
+        ('kind = "lost"\namount = 1', "amount: the kind lost has none; remove it"),
+        (
+            'kind = "wrong_length"\namount = 9',
+            "amount: has to be -8 to 8 [bytes more] for the kind wrong_length, not 9",
+        ),
+        ('kind = "lost"\nprobability = 1.5', "probability: has to be less than or equal to 1"),
+        ('kind = "lost"\ncan_id = 0x800', "can_id: has to be less than or equal to 2047"),
+        ('kind = "lots"', "kind: has to be 'lost', 'late'"),
+        ('kind = "lost"\nat = 1.0', "at: unknown key; did you mean at_s?"),
+        ("at_s = 1.0", "kind: is missing; add it"),
+    ],
+)
+def test_what_is_no_fault(tmp_path: Path, fault: str, line: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        load(file_with(tmp_path, fault))
+    assert "simulation.fault.0" in str(error.value)
+    assert line in str(error.value)
+
+
+def test_document_has_every_kind_with_its_number_and_default() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "faults.md").read_text(encoding="utf-8")
+    rows: dict[str, Any] = {
+        cells[2].strip(" `"): (int(cells[1]), cells[4].split(":")[0].strip().replace("−", "-"))
+        for cells in (line.split("|") for line in text.splitlines())
+        if len(cells) == 6 and cells[1].strip().isdigit()
+    }
+    assert {kind: number for kind, (number, _) in rows.items()} == NUMBERS
+    for kind, (_, default) in rows.items():
+        if kind in AMOUNTS:
+            assert int(default, 0) == AMOUNTS[kind].usual  # type: ignore[index]
+        else:
+            assert default == ""

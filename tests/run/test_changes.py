@@ -1,0 +1,152 @@
+"""A wall that is changed from outside while it is rendered."""
+
+import json
+import signal
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import COMMAND, Start, command, config_file
+from rig import SIM_CONFIG, Loop, RigFactory, settings_with
+
+from canwall.config import ConfigError
+from canwall.errors import RunFailedError
+from canwall.record import Mailbox, RunFolder, read_signals
+from canwall.run.changes import change, open_to_changes
+
+PATIENCE_S = 60.0
+
+
+def test_mailbox_hands_over_one_change_at_a_time() -> None:
+    mailbox = Mailbox.create()
+    taken: list[str] = []
+    answers: list[int] = []
+
+    def post(k: int) -> None:
+        # Each sender opens it for itself, as processes do.
+        other = Mailbox.open(mailbox.address)
+        answers.append(other.post(f"change {k}", PATIENCE_S))
+        other.close()
+
+    senders = [threading.Thread(target=post, args=(k,)) for k in range(5)]
+    for sender in senders:
+        sender.start()
+    while len(taken) < len(senders):
+        if mailbox.waiting():
+            taken.append(mailbox.take(100 + len(taken)))
+    for sender in senders:
+        sender.join()
+    assert sorted(taken) == [f"change {k}" for k in range(5)]
+    assert sorted(answers) == [100, 101, 102, 103, 104]
+    assert not mailbox.waiting()
+    other = Mailbox.open(mailbox.address)
+    with pytest.raises(ValueError, match="4096 is the most"):
+        other.post("x" * 5000, PATIENCE_S)
+    with pytest.raises(TimeoutError):
+        other.post("nobody takes this", 0.01)
+    other.close()
+    address = mailbox.address
+    mailbox.close()
+    with pytest.raises(OSError, match="No such file"):
+        Mailbox.open(address)
+
+
+def test_change_is_in_force_from_the_cycle_that_it_is_told(
+    make_rig: RigFactory, tmp_path: Path
+) -> None:
+    settings = settings_with({"run.more_laws": ["midpoint"], "wall.law": "half_sample"})
+    loop = Loop(make_rig(settings))
+    folder = RunFolder(tmp_path)
+    folder.config.write_text(settings.to_toml())
+    told: list[int] = []
+    wanted = [
+        ["stiffness_nm_per_rad=20", "limits.torque_nm=1.5"],
+        ["law=midpoint", "wall.position_rad = -0.01"],
+    ]
+    senders: list[threading.Thread] = []
+
+    def post(assignments: list[str]) -> None:
+        told.append(change(folder, assignments))
+
+    def at(j: int) -> bool:
+        if j in (300, 600):
+            senders.append(threading.Thread(target=post, args=(wanted[len(senders)],)))
+            senders[-1].start()
+            while loop.axis.mailbox is None or not loop.axis.mailbox.waiting():
+                time.sleep(0.001)
+        return False
+
+    with open_to_changes([loop.axis], [folder]):
+        outcome = loop.run(1000, at)
+    for sender in senders:
+        sender.join()
+    assert outcome.trips == []
+    assert told == [300, 600]
+    assert not folder.live.exists()
+    rows = loop.rows()
+    assert np.flatnonzero(np.diff(rows["stiffness"])).tolist() == [299]
+    assert np.flatnonzero(np.diff(rows["wall_position_rad"])).tolist() == [599]
+    assert np.flatnonzero(np.diff(rows["law"])).tolist() == [599]
+    assert loop.laws[rows["law"][-1]].name == "midpoint"
+    assert loop.record["torque_limit"][0] == 1.5
+
+
+def test_run_of_the_command_is_changed_by_the_command(start: Start, tmp_path: Path) -> None:
+    file = config_file(
+        tmp_path / "c.toml",
+        {'pace = "auto"': 'pace = "real_time"', "duration_s = 4.2": "# until Ctrl-C"},
+        SIM_CONFIG,
+    )
+    folder = tmp_path / "run"
+    run = start(COMMAND, "run", file, "--output", folder)
+    deadline = time.monotonic() + PATIENCE_S
+    while not (folder / "live.json").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    done = command("change", folder, "stiffness_nm_per_rad=12.5")
+    assert done.stderr == ""
+    assert done.stdout.startswith("in force from cycle ")
+    cycle = int(done.stdout.split()[4])
+    run.send_signal(signal.SIGINT)
+    assert run.wait(PATIENCE_S) == 130
+    stiffness = read_signals(folder / "signals.parquet")["stiffness"].to_numpy()
+    assert stiffness[cycle] == 12.5
+    assert stiffness[cycle - 1] == 50.0
+
+
+@pytest.mark.parametrize(
+    ("assignment", "message"),
+    [
+        ("stifness_nm_per_rad=1", "stifness_nm_per_rad: unknown key; did you mean stiffness_nm"),
+        ("stiffness_nm_per_rad=-1", "stiffness_nm_per_rad: has to be greater than or equal to 0"),
+        ("limits.torque=1", "limits.torque: unknown key; did you mean torque_nm?"),
+        ("position_rad=7", "position_rad = 7 lies outside the run's limits.position_rad"),
+        ("law=nothing", "law: unknown law 'nothing'"),
+        ("law=midpoint", "law midpoint is none of the run's: standard, half_sample; list it"),
+    ],
+)
+def test_impossible_change_is_not_posted(tmp_path: Path, assignment: str, message: str) -> None:
+    folder = RunFolder(tmp_path)
+    folder.config.write_text(settings_with().to_toml())
+    mailbox = Mailbox.create()
+    folder.live.write_text(json.dumps({"mailbox": mailbox.address}))
+    with pytest.raises(ConfigError) as error:
+        change(folder, [assignment])
+    assert str(error.value).startswith(message)
+    assert not mailbox.waiting()
+    mailbox.close()
+
+
+def test_run_that_is_over_takes_no_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = RunFolder(tmp_path)
+    with pytest.raises(ConfigError, match="no run goes on here"):
+        change(folder, ["stiffness_nm_per_rad=1"])
+    folder.config.write_text(settings_with().to_toml())
+    mailbox = Mailbox.create()
+    folder.live.write_text(json.dumps({"mailbox": mailbox.address}))
+    monkeypatch.setattr("canwall.run.changes._PATIENCE_S", 0.01)
+    with pytest.raises(RunFailedError, match="does not take the change"):
+        change(folder, ["stiffness_nm_per_rad=1"])
+    mailbox.close()

@@ -1,0 +1,336 @@
+"""Sweeps with a person at the handle, who is a script here: prompts, ways to end, verdicts."""
+
+import csv
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from commands import PATIENCE_S, Record, torque_is_on, wait_for
+from hypothesis import example, given
+from hypothesis import strategies as st
+from rig import SIM_CONFIG
+
+from canwall.errors import InputError
+from canwall.study.session import Verdict
+from canwall.study.staircase import Staircase, limits
+from canwall.study.terminal import SessionEndedError, Terminal
+
+SCRIPT = SIM_CONFIG.parents[1] / "scripts" / "by_hand.py"
+BEGINS, STRUCK = "Enter begins, q ends: ", "y, n, again: "
+#: The simulated hand strikes once a second.
+ONE, TWO, FOR_EVER = 1.0, 2.0, 1e6
+
+
+class Person:
+    """Somebody who reads the prompts and answers them."""
+
+    def __init__(self, what: str, folder: Path, *arguments: object) -> None:
+        self.folder = folder
+        self.process = subprocess.Popen(
+            [sys.executable, SCRIPT, what, SIM_CONFIG, "--output", folder, *map(str, arguments)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def read_to(self, *prompts: str) -> str:
+        """What is said up to one of the prompts, or to the end."""
+        assert self.process.stdout is not None
+        said = ""
+        while not said.endswith(prompts):
+            letter = self.process.stdout.read(1)
+            if not letter:
+                return said
+            said += letter
+        return said
+
+    def type(self, line: str) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(f"{line}\n")
+        self.process.stdin.flush()
+
+    def end(self) -> tuple[int, str, str]:
+        said, errors = self.process.communicate(timeout=PATIENCE_S)
+        return self.process.returncode, said, errors
+
+    @property
+    def verdicts(self) -> list[dict[str, str]]:
+        with (self.folder / "verdicts.csv").open(encoding="utf-8") as file:
+            return list(csv.DictReader(file))
+
+    def is_pressed(self, run: str) -> None:
+        """Wait until the wall has given torque."""
+        wait_for(lambda: torque_is_on(self.folder / run / "bus.log"))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tmp_path / "session"
+
+
+@pytest.fixture
+def people() -> Iterator[list[Person]]:
+    started: list[Person] = []
+    yield started
+    for person in started:
+        person.process.kill()
+        person.process.communicate()
+
+
+def test_a_staircase(folder: Path, people: list[Person]) -> None:
+    person = Person(
+        *("staircase", folder, "--law", "standard", "--seconds", ONE),
+        *("--start", 20, "--ceiling", 60, "--finest", 2),
+    )
+    people.append(person)
+    asked = []
+    while (said := person.read_to(BEGINS, STRUCK)).endswith((BEGINS, STRUCK)):
+        if said.endswith(BEGINS):
+            asked.append(float(re.findall(r"K = (\S+) N·m/rad", said)[0]))
+            person.type("")
+        else:
+            person.type("y" if asked[-1] < 25.0 else "n")
+    assert person.end() == (0, "", "")
+    assert asked == [20, 40]
+    assert re.search(r"standard │ +20 N·m/rad │ +40 N·m/rad", said)
+    assert [v["run"] for v in person.verdicts] == ["01-K20", "02-K40"]
+    assert [v["free_of_chatter"] for v in person.verdicts] == ["True", "False"]
+    for verdict in person.verdicts:
+        record = Record(folder / verdict["run"])
+        (strike,) = record.summary["strikes"]
+        assert verdict["law"] == strike["law"] == "standard"
+        assert float(verdict["stiffness_nm_per_rad"]) == strike["stiffness"]
+        assert verdict["measured_chatter"] == str(strike["chatter"])
+        assert float(verdict["energy_out_j"]) == strike["energy_out_max_j"]
+        assert (folder / verdict["run"] / "run.png").exists()
+    assert [v["measured_chatter"] for v in person.verdicts] == ["False", "True"]
+
+
+def test_laws_in_turn(folder: Path, people: list[Person]) -> None:
+    laws = ("standard", "half_sample+deadbeat")
+    person = Person(
+        *("alternating", folder, "--law", laws[0], "--law", laws[1]),
+        *("--stiffness", "60,50,70", "--seconds", TWO),
+    )
+    people.append(person)
+    said = person.read_to(BEGINS)
+    person.type("")
+    said += person.read_to(STRUCK)
+    assert said.endswith("Strikes 1: free of chatter? y, n, again: ")
+    person.type("maybe")
+    said += person.read_to(STRUCK)
+    person.type("n")
+    said += person.read_to(STRUCK)
+    assert said.endswith("Strikes 2: free of chatter? y, n, again: ")
+    assert not any(law in said for law in laws)
+    # Once more, with other verdicts.
+    person.type("again")
+    person.read_to(BEGINS)
+    person.type("")
+    for answer in ("n", "y"):
+        person.read_to(STRUCK)
+        person.type(answer)
+    person.read_to(BEGINS)
+    person.type("")
+    assert "The wall: free of chatter?" in person.read_to(STRUCK)
+    person.type("n")
+    code, said, errors = person.end()
+    assert (code, errors) == (0, "")
+    assert re.search(r"standard +│ +0 N·m/rad │ +50 N·m/rad", said)
+    assert re.search(r"half_sample\+deadbeat │ +50 N·m/rad │ +60 N·m/rad", said)
+    found = [(v["step"], v["law"], v["free_of_chatter"]) for v in person.verdicts]
+    assert found == [
+        *(("2", laws[0], "False"), ("2", laws[1], "True"), ("3", laws[1], "False")),
+    ]
+
+
+def assert_ended(folder: Path) -> None:
+    """The run in the folder was ended, and its last frames show the drive disabled."""
+    record = Record(folder)
+    assert record.summary["interrupted"]
+    assert not record.summary["trips"]
+    *_, (tpdo, rpdo) = record.cycles
+    assert rpdo[2:4] == b"\0\0"
+    # Statusword: no longer OPERATION ENABLED.
+    assert tpdo is not None
+    assert tpdo[4] & 0x07 != 0x07
+
+
+def test_enter_ends_a_wall_and_q_the_session(folder: Path, people: list[Person]) -> None:
+    person = Person("staircase", folder, "--seconds", FOR_EVER)
+    people.append(person)
+    person.read_to(BEGINS)
+    person.type("")
+    person.is_pressed("01-K5")
+    person.type("")
+    assert "The drive is disabled." in person.read_to(STRUCK)
+    person.type("n")
+    person.read_to(BEGINS)
+    person.type("")
+    person.is_pressed("02-K2.5")
+    person.type("q")
+    code, said, errors = person.end()
+    assert (code, errors) == (0, "")
+    assert "The drive is disabled." in said
+    assert "free of chatter?" not in said
+    assert "1 verdicts" in said
+    assert_ended(folder / "01-K5")
+    assert_ended(folder / "02-K2.5")
+
+
+@pytest.mark.parametrize("way", ["Ctrl-C", "no terminal"])
+def test_a_wall_ends_with_its_person(folder: Path, people: list[Person], way: str) -> None:
+    person = Person("staircase", folder, "--seconds", FOR_EVER)
+    people.append(person)
+    person.read_to(BEGINS)
+    person.type("")
+    person.is_pressed("01-K5")
+    if way == "Ctrl-C":
+        os.kill(person.process.pid, signal.SIGINT)
+    else:
+        assert person.process.stdin is not None
+        person.process.stdin.close()
+        person.process.stdin = None
+    code, said, errors = person.end()
+    assert (code, errors) == (130 if way == "Ctrl-C" else 0, "")
+    assert "The drive is disabled." in said
+    assert "0 verdicts" in said
+    assert_ended(folder / "01-K5")
+
+
+def test_ctrl_c_between_two_walls(folder: Path, people: list[Person]) -> None:
+    person = Person("staircase", folder)
+    people.append(person)
+    person.read_to(BEGINS)
+    os.kill(person.process.pid, signal.SIGINT)
+    code, said, errors = person.end()
+    assert (code, errors) == (130, "")
+    assert "0 verdicts" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["--law", "none"], "wall.law: unknown law 'none'"),
+        (["--output", "/proc/none"], "/proc/none: cannot be written"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(
+    folder: Path, arguments: list[str], line: str
+) -> None:
+    code, _, errors = Person("staircase", folder, *arguments).end()
+    assert code == 2
+    assert errors.startswith(f"canwall: {line}")
+    assert len(errors.splitlines()) == 1
+    assert not folder.exists()
+
+
+def test_a_folder_with_a_session_is_left_alone(folder: Path) -> None:
+    folder.mkdir()
+    (folder / "verdicts.csv").write_text("mine")
+    code, _, errors = Person("staircase", folder).end()
+    assert code == 2
+    assert errors == f"canwall: {folder}: holds a session already; choose another --output\n"
+    assert (folder / "verdicts.csv").read_text() == "mine"
+
+
+@example(limit=0.5, start=46.0, ceiling=50.0, finest=1.25)
+@given(
+    limit=st.floats(0.5, 1000.0),
+    start=st.floats(1.0, 50.0),
+    ceiling=st.floats(50.0, 500.0),
+    finest=st.floats(1.01, 3.0),
+)
+def test_a_staircase_ends_at_the_limit(
+    limit: float, start: float, ceiling: float, finest: float
+) -> None:
+    asked: list[float] = []
+
+    def is_free(stiffness: float) -> bool:
+        asked.append(stiffness)
+        return stiffness < limit
+
+    Staircase(start, ceiling, finest).climb(is_free)
+    assert max(asked) <= ceiling
+    if limit > ceiling:
+        assert asked[-1] == ceiling
+    elif limit < min(asked):
+        assert asked[-1] < start / 64.0
+    else:
+        one, other = sorted(asked[-2:])
+        assert one < limit <= other
+        assert other <= one * finest * (1.0 + 1e-12)
+
+
+def test_who_errs_once_is_brought_back() -> None:
+    asked: list[float] = []
+
+    def is_free(stiffness: float) -> bool:
+        asked.append(stiffness)
+        return stiffness < 100.0 and len(asked) != 2
+
+    Staircase(5.0, 500.0, 1.1).climb(is_free)
+    assert min(asked[-2:]) < 100.0 <= max(asked[-2:])
+
+
+def test_limits_are_the_stiffest_free_and_the_softest_that_is_not() -> None:
+    def verdict(law: str, stiffness: float, free: bool) -> Verdict:
+        return Verdict(1, "", law, stiffness, 1, free, False, "", 0.0, 0.0, "")
+
+    said = [verdict("a", 5, True), verdict("a", 20, False), verdict("a", 10, True)]
+    assert limits([*said, verdict("b", 5, False)]) == {"a": (10, 20), "b": (0.0, 5)}
+    assert limits([]) == {}
+
+
+@pytest.mark.parametrize(
+    ("start", "ceiling", "finest", "what"),
+    [
+        (0.0, 10.0, 1.1, "--start 0: has to be above 0"),
+        (20.0, 10.0, 1.1, "at most the ceiling, 10"),
+        (1.0, float("inf"), 1.1, "at most the ceiling, inf"),
+        (1.0, 2.0, 1.0, "--finest 1: has to be a factor above 1"),
+    ],
+)
+def test_impossible_steps(start: float, ceiling: float, finest: float, what: str) -> None:
+    with pytest.raises(InputError, match=what):
+        Staircase(start, ceiling, finest)
+
+
+@pytest.fixture
+def keyboard() -> Iterator[tuple[Terminal, Any]]:
+    reading, writing = os.pipe()
+    with os.fdopen(writing, "w", buffering=1) as keys:
+        yield Terminal(reading), keys
+    os.close(reading)
+
+
+def test_what_was_typed_before_is_no_answer(keyboard: tuple[Terminal, Any]) -> None:
+    terminal, keys = keyboard
+    keys.write("y\n\nq\nhalf a line")
+    terminal.discard_input()
+    assert terminal.pressed() is None
+    keys.write("N \n")
+    assert terminal.ask("?", ("y", "n")) == "n"
+
+
+def test_lines_while_a_wall_is_rendered(
+    keyboard: tuple[Terminal, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("canwall.study.terminal._LOOKS_S", 0.0)
+    terminal, keys = keyboard
+    assert terminal.pressed() is None
+    keys.write("q")
+    assert terminal.pressed() is None
+    keys.write("\n\n")
+    assert [terminal.pressed(), terminal.pressed(), terminal.pressed()] == ["q", "", None]
+    keys.close()
+    assert [terminal.pressed(), terminal.pressed()] == ["q", "q"]
+    with pytest.raises(SessionEndedError):
+        terminal.ask("?", ("",))
