@@ -18,14 +18,22 @@ _R = TypeVar("_R")
 Record: TypeAlias = Any
 
 
+#: Rooms without anything that compiled code elsewhere calls, lays out or has as a constant.
+_WITHOUT_COMPILED_CODE = ("bench", "cli", "config", "study", "sweep", "workbench")
+
+
 def _drop_stale_code() -> None:
-    """Remove compiled code that was kept on disk before any source of the package changed.
+    """Remove compiled code that was kept on disk before a source that it may depend on changed.
 
     numba sees a change of the file that a function stands in, not of those that it calls into: a
     law would go on using the estimator of the day on which it was compiled.
     """
     package = Path(__file__).resolve().parent
-    sources = sorted(package.rglob("*.py"))
+    sources = sorted(
+        path
+        for path in package.rglob("*.py")
+        if path.relative_to(package).parts[0] not in _WITHOUT_COMPILED_CODE
+    )
     states = [(str(s.relative_to(package)), s.stat().st_mtime_ns) for s in sources]
     digest = hashlib.sha256(repr(states).encode()).hexdigest()
     note = package / "__pycache__" / "sources.sha256"
