@@ -16,10 +16,9 @@ from canwall.bus import socket_pair
 from canwall.config import Settings
 from canwall.cycle import (
     Exchange,
-    ExternalSync,
-    NativeExchange,
     Outcome,
-    PythonCanExchange,
+    PythonCanTransport,
+    SocketTransport,
     WallAxis,
     WallStage,
     run_laws,
@@ -188,11 +187,8 @@ class Loop:
 
     def make_exchange(self, real_time: bool = False, external_sync: bool = False) -> Exchange:
         """The exchange that the rig is for, with its own SYNC or somebody else's."""
-        link, axes = self.rig.link, [self.axis]
-        if self.rig.native:
-            return NativeExchange(link, axes, real_time, external_sync)
-        sync = ExternalSync(link, SYNC, 0.001) if external_sync else None
-        return PythonCanExchange(link, axes, real_time, sync)
+        transport = SocketTransport if self.rig.native else PythonCanTransport
+        return Exchange(self.rig.link, [self.axis], real_time, external_sync, transport)
 
     def run(
         self,

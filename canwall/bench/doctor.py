@@ -7,17 +7,21 @@ that was changed is put back.
 import contextlib
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, field
 
 from canwall.bench.budget import USABLE, BudgetFrame, bus_budget
+from canwall.bench.latency import measured_settings
 from canwall.config import Settings
-from canwall.drive import DriveError, DriveNode, DriveSetup, Link, PdoLayout, set_up
+from canwall.cycle import Exchange, Loop, WallAxis, WallGivenUpError, run_laws
+from canwall.drive import DriveError, DriveNode, DriveSetup, Link, PdoLayout, disable, set_up
 from canwall.drive import objects as od
 from canwall.drive.cia402 import DriveState, state_of, status_text
 from canwall.drive.pdo import tpdos_on_sync
-from canwall.drive.trial import Trial
 from canwall.eds import load_eds
 from canwall.errors import RunFailedError
+from canwall.record import Ring
+from canwall.run import make_exchange
 
 #: Seconds of a living master before it falls silent: some drives watch from the second sign on.
 _ALIVE_S = 0.2
@@ -63,6 +67,7 @@ def examine(
     Whatever happens, torque is zero, the drive is disabled and put back at the end. Raises
     DriveError where the drive cannot be set up or does not follow, can.CanError.
     """
+    settings = measured_settings(settings)
     dictionary = load_eds(settings.drive.eds, settings.drive.node_id, required)
     node = DriveNode(link, settings.drive.node_id, dictionary)
     try:
@@ -153,50 +158,54 @@ def _test(
     findings: Findings,
 ) -> None:
     """Enable with zero torque, fall silent, and watch the drive let go."""
-    trial = Trial(node, setup, settings.bus.cycle_s)
+    axis = WallAxis(node, setup, settings, run_laws(settings), Ring.create())
     announce("enabling the drive with zero torque: keep clear of the handle")
     try:
-        trial.enable()
-        findings.add("enabling", "0x6041", "OPERATION ENABLED with zero torque")
-        if setup.watchdog.kind != "none":
-            _fall_silent(node, setup, trial, announce, findings)
-        trial.disable()
+        with closing(make_exchange(node.link, [axis])) as exchange:
+            loop = Loop(exchange)
+            loop.enable()
+            findings.add("enabling", "0x6041", "OPERATION ENABLED with zero torque")
+            if setup.watchdog.kind != "none":
+                _fall_silent(axis, exchange, announce, findings)
+            loop.leave()
+        disable(node)
+    except WallGivenUpError as error:
+        raise DriveError(f"node {node.node_id}: {error}") from None
     except BaseException:
         # The cycle may be what does not work, or somebody lost patience; SDO gets through.
         with contextlib.suppress(DriveError):
             node.write(od.TARGET_TORQUE, 0, 0)
             node.write(od.CONTROLWORD, 0, 0)
         raise
+    finally:
+        axis.ring.close()
 
 
 def _fall_silent(
-    node: DriveNode,
-    setup: DriveSetup,
-    trial: Trial,
-    announce: Callable[[str], None],
-    findings: Findings,
+    axis: WallAxis, exchange: Exchange, announce: Callable[[str], None], findings: Findings
 ) -> None:
-    watchdog = setup.watchdog
+    node, watchdog = axis.node, axis.setup.watchdog
     alive_until = time.monotonic() + max(_ALIVE_S, 2.0 * watchdog.time_s)
     while time.monotonic() < alive_until:
-        statusword = trial.cycle(0x0F)
-        if statusword is not None and state_of(statusword) is not DriveState.OPERATION_ENABLED:
+        exchange.cycle()
+        statusword = int(axis.cycle["statusword"][0])
+        if state_of(statusword) is not DriveState.OPERATION_ENABLED:
             raise RunFailedError(
                 f"node {node.node_id} went to {status_text(statusword)} while its master was "
                 f"alive: drive.watchdog_s = {watchdog.time_s:g} may be too short for this machine"
             )
+    last_sign_s = _last_sign_of_life_s(axis, exchange)
     announce(f"falling silent, as a dead master would: {watchdog.kind}")
-    give_up = trial.last_sign_of_life + watchdog.time_s + _LATE_S
     while True:
         statusword = node.read(od.STATUSWORD)
-        seen = time.monotonic()
+        silent_s = time.perf_counter() - last_sign_s
         if state_of(statusword) is not DriveState.OPERATION_ENABLED:
             break
-        if seen >= give_up:
+        if silent_s >= watchdog.time_s + _LATE_S:
             findings.add(
                 "watchdog",
                 "tested",
-                f"no reaction within {seen - trial.last_sign_of_life:.3f} s: the drive stays in "
+                f"no reaction within {silent_s:.3f} s: the drive stays in "
                 f"{status_text(statusword)}",
                 well=False,
             )
@@ -204,8 +213,14 @@ def _fall_silent(
     findings.add(
         "watchdog",
         "tested",
-        f"{status_text(statusword)} {(seen - trial.last_sign_of_life) * 1e3:.0f} ms after the "
-        f"last sign of life",
+        f"{status_text(statusword)} {silent_s * 1e3:.0f} ms after the last sign of life",
     )
     # What 0x1029 makes of it may be another NMT state, without PDOs.
     node.command("OPERATIONAL")
+
+
+def _last_sign_of_life_s(axis: WallAxis, exchange: Exchange) -> float:
+    """Return when the drive last saw a frame that its watchdog waits for [s, perf_counter]."""
+    if axis.setup.watchdog.error_control is not None:
+        return exchange.last_error_control_ns * 1e-9
+    return exchange.last_sync_ns * 1e-9 + float(axis.row["latency_s"][0])

@@ -61,7 +61,7 @@ class CycleSocket:
             self._own = _open(str(bus.channel), received)  # type: ignore[attr-defined]
             self.descriptor = self._own.fileno()
             self.stamped = True
-            _leave_out(bus, {*received, *sent})
+            _leave_out(bus, {*received, *(can_id & _STANDARD for can_id in sent)})
         else:
             raise can.CanInitializationError(
                 "the native exchange needs SocketCAN or unixcan; use bus.exchange = 'python-can'"

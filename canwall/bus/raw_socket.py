@@ -21,6 +21,9 @@ from canwall.compiled import Record, compiled
 CAN_FRAME = np.dtype(
     [("can_id", "u4"), ("length", "u1"), ("reserved", "u1", (3,)), ("data", "<i8")], align=True
 )
+#: Flags of an identifier (linux/can.h).
+CAN_EFF, CAN_RTR, CAN_ERR = 1 << 31, 1 << 30, 1 << 29
+
 #: One frame, and what the calls below need besides: `struct iovec`, `struct msghdr`, a control
 #: message with a time stamp, `struct pollfd`, `struct timespec`.
 PORT = np.dtype(

@@ -3,16 +3,17 @@
 from canwall.cycle.axis import WallAxis, WallStage
 from canwall.cycle.bus_monitor import BusMonitor
 from canwall.cycle.delay import measured_delay
-from canwall.cycle.exchange import Exchange, PythonCanExchange
+from canwall.cycle.exchange import Exchange, SyncLostError
 from canwall.cycle.laws import named_law, run_laws, with_law
-from canwall.cycle.loop import Outcome, run_loop
+from canwall.cycle.loop import Loop, Outcome, WallGivenUpError, run_loop
 from canwall.cycle.machine import real_time_machine
-from canwall.cycle.native import NativeExchange
+from canwall.cycle.python_can import PythonCanTransport
 from canwall.cycle.realtime import Grant, real_time_priority
+from canwall.cycle.sockets import SocketTransport
 from canwall.cycle.state import CYCLE, MAX_LAWS, fade_in, make_cycle, set_wall, start_at
 from canwall.cycle.step import step
-from canwall.cycle.sync import ExternalSync, ProducedSync
 from canwall.cycle.timing import HISTOGRAM, buckets_ns, observe_ns, percentile_ns, timing_summary
+from canwall.cycle.transport import CycleFrames, Transport
 from canwall.cycle.trips import Trip
 
 __all__ = [
@@ -20,15 +21,18 @@ __all__ = [
     "HISTOGRAM",
     "MAX_LAWS",
     "BusMonitor",
+    "CycleFrames",
     "Exchange",
-    "ExternalSync",
     "Grant",
-    "NativeExchange",
+    "Loop",
     "Outcome",
-    "ProducedSync",
-    "PythonCanExchange",
+    "PythonCanTransport",
+    "SocketTransport",
+    "SyncLostError",
+    "Transport",
     "Trip",
     "WallAxis",
+    "WallGivenUpError",
     "WallStage",
     "buckets_ns",
     "fade_in",

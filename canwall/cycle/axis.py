@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.config import Limits, Settings, Wall
+from canwall.cycle.core import DRIVE_FRAMES
 from canwall.cycle.state import SYNCHRONOUS_DELAY, make_cycle
 from canwall.cycle.timing import HISTOGRAM
 from canwall.cycle.trips import Trip
@@ -38,16 +39,14 @@ class WallAxis:
     mailbox: Mailbox | None = None
     #: Why the wall was given up, where it is something that came beside the cycle.
     reported: str = ""
-    late_rpdo: int = 0
-    late_in_a_row: int = 0
-    #: The length of the last TPDO that did not carry what was mapped [bytes]; None: there was none.
-    wrong_length: int | None = None
     #: The next of the walls that take turns, counted from the first on.
     next_turn: int = 1
 
     def __post_init__(self) -> None:
         self.cycle: NDArray[np.void] = make_cycle(self.settings, self.setup, self.laws)
         self.row = np.zeros(1, ROW)
+        #: Its frames and their lateness, of dtype DRIVE_FRAMES; where the exchange has put them.
+        self.frames = np.zeros(1, DRIVE_FRAMES)
         #: From a TPDO to its RPDO, and from the instant at which the SYNC was due to the RPDO.
         self.latency, self.sync_to_rpdo = np.zeros(1, HISTOGRAM), np.zeros(1, HISTOGRAM)
         given = self.settings.estimator.delay_cycles
@@ -64,6 +63,22 @@ class WallAxis:
     def active(self) -> bool:
         """Whether there may be a torque: the wall is rendered, or the delay measured."""
         return int(self.cycle["phase"][0]) in (Phase.RENDERING, Phase.MEASURING)
+
+    @property
+    def late_rpdo(self) -> int:
+        """RPDOs that were sent after the next SYNC was due."""
+        return int(self.frames["late_rpdo"][0])
+
+    @property
+    def late_in_a_row(self) -> int:
+        """Those since the last one in time."""
+        return int(self.frames["late_in_a_row"][0])
+
+    @property
+    def wrong_length(self) -> int | None:
+        """Length of the last TPDO that did not carry what was mapped [bytes], None without one."""
+        length = int(self.frames["wrong_length"][0])
+        return length if length >= 0 else None
 
     def give_up(self, text: str) -> None:
         """End the wall for something that came beside the cycle; the first such thing counts.

@@ -1,21 +1,30 @@
-"""The exchange of one cycle's frames over python-can, for any adapter that it supports."""
+"""The exchange of a cycle's frames: the compiled core (`core`) on a transport, as the loop sees it.
+
+In real time the SYNCs keep to absolute deadlines; in simulated time they follow one another as
+fast as the drives answer.
+"""
 
 import time
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
+import can
 import numpy as np
+from numpy.typing import NDArray
 
-from canwall.bus import DataFrame
-from canwall.compiled import data_to_number, number_to_data
+from canwall.bus.can_ids import EMCY, ERROR_CONTROL, PDOS
+from canwall.bus.raw_socket import CAN_RTR
+from canwall.compiled import data_to_number
+from canwall.cycle import core as cycle_core
 from canwall.cycle.axis import WallAxis
-from canwall.cycle.beats import Beats
+from canwall.cycle.core import CORE, DRIVE_FRAMES, INBOX, Handling, Want
+from canwall.cycle.python_can import PythonCanTransport
 from canwall.cycle.step import step
-from canwall.cycle.sync import ProducedSync, SyncSource
-from canwall.cycle.timing import HISTOGRAM, observe_ns
-from canwall.drive import Link
+from canwall.cycle.timing import HISTOGRAM
+from canwall.cycle.transport import CycleFrames, TransportFactory
+from canwall.drive import Link, Watchdog
+from canwall.drive.watchdog import ErrorControlFrame
 from canwall.record import Phase
-from canwall.record.ring import put_row
+from canwall.record.ring import FRAME, HEADER, RECEIVED, Ring, to_message
 
 #: In simulated time nothing is late: this long a TPDO is waited for before it counts as lost.
 _SIMULATED_TIMEOUT_S = 1.0
@@ -23,183 +32,293 @@ _SIMULATED_TIMEOUT_S = 1.0
 _MISSING_TIMEOUT_S = 0.05
 #: The part of a real cycle in which the TPDO has to arrive, for the RPDO to be in time.
 _SYNCHRONOUS_WINDOW = 0.8
-#: How full the ring of the record may be before simulated time waits for its writer.
-BACKLOG = 0.5
-#: A writer that takes nothing for this long is taken for gone; what is lost is counted.
+#: A writer that takes nothing for this long has died; what is lost is counted.
 _WRITER_PATIENCE_S = 10.0
+#: Without a SYNC for this long, and no less than so many periods, its producer has fallen silent.
+_SYNC_PATIENCE_S, _SYNC_PATIENCE_CYCLES = 0.1, 10
 
 
-class Exchange(ABC):
-    """SYNC, TPDOs, steps, RPDOs: the cycle of all axes, in whatever way its frames are exchanged.
+class SyncLostError(can.CanOperationError):
+    """The producer of the SYNC has fallen silent."""
 
-    In real time the SYNCs keep to absolute deadlines; in simulated time they follow one another
-    as fast as the drives answer.
-    """
-
-    #: How it is called in a summary.
-    name: str
-    #: How many cycles it may do before the loop looks after everything else again.
-    ahead = 1
-
-    def __init__(self, link: Link, axes: Sequence[WallAxis], real_time: bool) -> None:
-        self._link = link
-        self.axes = axes
-        self._real_time = real_time
-        self._period_s = float(axes[0].cycle["period"][0])
-        self._period_ns = round(self._period_s * 1e9)
-        window_s = self._period_s * _SYNCHRONOUS_WINDOW
-        self._timeout_s = window_s if real_time else _SIMULATED_TIMEOUT_S
-        self._missing_timeout_s = min(self._timeout_s, _MISSING_TIMEOUT_S)
-        #: Intervals of the SYNC, and how far each is from its period.
-        self.sync_interval, self.sync_error = np.zeros(1, HISTOGRAM), np.zeros(1, HISTOGRAM)
-        #: Whether simulated time waits for the writer of the record; False once it is gone.
-        self.waits_for_writer = True
-        for axis in axes:
-            _warm_up(axis)
-
-    @abstractmethod
-    def cycle(self, most: int = 1) -> None:
-        """One cycle; or, where there is nothing to be done in between, several, `most` at most.
-
-        Raises can.CanError where the bus fails.
-        """
-
-    @property
-    @abstractmethod
-    def last_sync_ns(self) -> int:
-        """When the latest SYNC was, by time.perf_counter_ns; 0: there was none yet."""
-
-    def longest_pause_s(self) -> float:
-        """The longest that the drives have been without a SYNC, from the latest to now as well."""
-        since = time.perf_counter_ns() - self.last_sync_ns if self.last_sync_ns else 0
-        return max(int(self.sync_interval["largest_ns"][0]), since) * 1e-9
-
-    def close(self) -> None:  # noqa: B027 (only some have anything to give back)
-        """Give back what the exchange has opened; the link stays open."""
-
-    def _check_late(self, axis: WallAxis) -> None:
-        """Give the wall up whose RPDOs have come too late for too many cycles."""
-        most = axis.limits.late_cycles
-        if most and axis.late_in_a_row >= most:
-            axis.give_up(
-                f"RPDOs after the next SYNC for {axis.late_in_a_row} cycles, limits.late_cycles = "
-                f"{most}: the machine is too slow for bus.cycle_s"
-            )
-
-    def _record_is_behind(self) -> bool:
-        return any(axis.ring.backlog() > BACKLOG for axis in self.axes)
-
-    def _wait_for_writer(self) -> None:
-        if not self._record_is_behind():
-            return
-        deadline = time.monotonic() + _WRITER_PATIENCE_S
-        while self.waits_for_writer and self._record_is_behind():
-            time.sleep(0.001)
-            self.waits_for_writer = time.monotonic() < deadline
+    def __init__(self, patience_s: float) -> None:
+        super().__init__(f"no SYNC from its producer for {patience_s:g} s")
 
 
-class PythonCanExchange(Exchange):
-    """The exchange over python-can, for any adapter that it supports."""
+class _FrameRing:
+    """Frames that compiled code leaves to this process."""
 
-    name = "python-can"
+    def __init__(self) -> None:
+        self.header, self.frames = np.zeros(1, HEADER), np.zeros(INBOX, FRAME)
+
+    def take(self) -> Iterator[NDArray[np.void]]:
+        """Yield each frame that waits, the oldest first."""
+        header = self.header
+        while header["frame_tail"][0] < header["frame_head"][0]:
+            frame = self.frames[header["frame_tail"][0] % len(self.frames)].copy()
+            header["frame_tail"] += 1
+            yield frame
+
+
+class Exchange:
+    """SYNC, TPDOs, steps and RPDOs of all axes, cycle by cycle."""
 
     def __init__(
         self,
         link: Link,
         axes: Sequence[WallAxis],
         real_time: bool,
-        sync: SyncSource | None = None,
+        external_sync: bool = False,
+        transport: TransportFactory = PythonCanTransport,
     ) -> None:
-        """Without a `sync`, the master produces it as the first axis' drive wants it."""
-        super().__init__(link, axes, real_time)
+        """Prepare the cycles of axes that share a SYNC, the first axis' drive's.
+
+        Args:
+            link: the bus.
+            axes: drives that are set up, and their walls.
+            real_time: whether SYNCs keep to the clock.
+            external_sync: whether somebody else produces the SYNC.
+            transport: moves the frames.
+
+        Raises:
+            can.CanInitializationError: the transport cannot work on this bus.
+        """
+        self._link = link
+        self.axes = axes
+        self._real_time = real_time
+        self._period_s = float(axes[0].cycle["period"][0])
+        #: Cycles that may be done before the loop looks after everything else again.
+        self.ahead = 1
+        #: Intervals of the SYNC, and how far each is from its period.
+        self.sync_interval, self.sync_error = np.zeros(1, HISTOGRAM), np.zeros(1, HISTOGRAM)
+        #: Whether simulated time waits for the writer of the record; False once it has died.
+        self.waits_for_writer = True
+        self._inbox, self._unlogged = _FrameRing(), _FrameRing()
+        self._error_control = _error_control_frames(axis.setup.watchdog for axis in axes)
+        self._drives = np.zeros(len(axes), DRIVE_FRAMES)
+        for k, axis in enumerate(axes):
+            axis.frames = self._drives[k : k + 1]
+            _lay_out(axis)
+        self._handling = _handling(axes)
+        self._subscribed = -1
+        self._core = self._make_core(external_sync)
+        for axis in axes:
+            _warm_up(axis)
         setup = axes[0].setup
-        self._sync = sync or ProducedSync(
-            link, setup.sync_cob_id, setup.sync_counter_overflow, self._period_s, real_time
+        self.transport = transport(
+            link,
+            self._core,
+            CycleFrames(
+                (*self._drives["tpdo_id"].tolist(), *np.flatnonzero(self._handling).tolist()),
+                (
+                    setup.sync_cob_id,
+                    *self._drives["rpdo_id"].tolist(),
+                    *self._error_control["can_id"].tolist(),
+                ),
+                real_time,
+                self._period_s,
+            ),
         )
-        self._by_tpdo = {axis.setup.tpdo.cob_id: axis for axis in axes}
-        self._rpdos = {
-            id(axis): DataFrame(axis.setup.rpdo.cob_id, bytes(axis.setup.rpdo.length))
-            for axis in axes
-        }
-        self._beats = Beats(link, (axis.setup.watchdog for axis in axes))
-        self._last_sync_ns = 0
-        #: Whether a message's time stamp is the kernel's, by the clock of time.time.
-        self._stamped = type(link.bus).__module__.startswith("can.interfaces.socketcan")
+        # What is compiled is loaded at its first call.
+        cycle_core.begin(self._core, 0, 0)
+        self.transport.run()
+
+    def _make_core(self, external_sync: bool) -> NDArray[np.void]:
+        core, setup = np.zeros(1, CORE), self.axes[0].setup
+        window_s = self._period_s * _SYNCHRONOUS_WINDOW
+        timeout_s = window_s if self._real_time else _SIMULATED_TIMEOUT_S
+        core["real_time"], core["external_sync"] = self._real_time, external_sync
+        core["sync_id"], core["sync_overflow"] = setup.sync_cob_id, setup.sync_counter_overflow
+        core["period_ns"] = _ns(self._period_s)
+        core["sync_patience_ns"] = _ns(self._sync_patience_s)
+        core["timeout_ns"] = _ns(timeout_s)
+        core["missing_timeout_ns"] = _ns(min(timeout_s, _MISSING_TIMEOUT_S))
+        core["sync_interval"] = self.sync_interval.ctypes.data
+        core["sync_error"] = self.sync_error.ctypes.data
+        core["drives"], core["drives_length"] = self._drives.ctypes.data, len(self._drives)
+        core["error_control"] = self._error_control.ctypes.data
+        core["error_control_length"] = len(self._error_control)
+        core["inbox_header"] = self._inbox.header.ctypes.data
+        core["inbox"] = self._inbox.frames.ctypes.data
+        return core
+
+    @property
+    def name(self) -> str:
+        """How a summary calls it."""
+        return self.transport.name
+
+    @property
+    def deadline_ns(self) -> int:
+        """Instant at which the next SYNC is due, by time.perf_counter_ns."""
+        return int(self._core["deadline_ns"][0])
 
     @property
     def last_sync_ns(self) -> int:
-        """When the latest SYNC was, by time.perf_counter_ns; 0: there was none yet."""
-        return self._last_sync_ns
+        """Instant of the latest SYNC, by time.perf_counter_ns; 0: there was none yet."""
+        return int(self._core["sync_ns"][0])
+
+    @property
+    def last_error_control_ns(self) -> int:
+        """Instant of the latest heartbeat or guarding frame; 0: there was none yet."""
+        frames = self._error_control
+        sent = [int(f["due_ns"] - f["period_ns"]) for f in frames if f["due_ns"]]
+        return max(sent, default=0)
+
+    @property
+    def _sync_patience_s(self) -> float:
+        return max(_SYNC_PATIENCE_S, _SYNC_PATIENCE_CYCLES * self._period_s)
+
+    def longest_pause_s(self) -> float:
+        """Longest time that the drives have been without a SYNC, the one until now included."""
+        since = time.perf_counter_ns() - self.last_sync_ns if self.last_sync_ns else 0
+        return max(int(self.sync_interval["largest_ns"][0]), since) * 1e-9
 
     def cycle(self, most: int = 1) -> None:
-        """One cycle. Raises can.CanError where the bus fails."""
-        missing = any(axis.cycle["missed_in_a_row"][0] for axis in self.axes)
-        if not self._real_time:
+        """Do one cycle; or up to `most`, where there is nothing to be done in between.
+
+        Raises:
+            can.CanError: the bus has failed.
+        """
+        core = self._core
+        core["writer_reads"] = self.waits_for_writer
+        for axis in self.axes:
+            axis.frames["late_limit"] = axis.limits.late_cycles
+        self._choose_log()
+        self._choose_handling()
+        cycle_core.begin(core, most, time.time_ns() - time.perf_counter_ns())
+        try:
+            while (want := self.transport.run()) != Want.DONE:
+                self._serve_python(want)
+        except BaseException:
+            cycle_core.abandon(core)
+            raise
+        finally:
+            self._serve_frames()
+        for axis in self.axes:
+            _check_late(axis)
+        self.transport.finish_cycle()
+
+    def close(self) -> None:
+        """Give back what the transport has opened; the link stays open."""
+        self.transport.close()
+
+    def _serve_python(self, want: Want) -> None:
+        if want == Want.HAND_OVER:
+            self._serve_frames()
+        elif want == Want.WRITER:
             self._wait_for_writer()
-        interval_s = self._begin()
-        awaited = self._by_tpdo.copy()
-        timeout = self._missing_timeout_s if missing else self._timeout_s
-        deadline = time.monotonic() + timeout
-        while awaited:
-            message = self._link.wait_for(awaited, timeout)
-            received_ns = time.perf_counter_ns()
-            if message is None:
-                break
-            if self._stamped:
-                received_ns -= max(0, time.time_ns() - round(message.timestamp * 1e9))
-            axis = awaited.pop(message.arbitration_id)
-            # A TPDO that is too short does not carry what was mapped: as good as none.
-            complete = len(message.data) >= axis.setup.tpdo.length
-            if not complete:
-                axis.wrong_length = len(message.data)
-            data = data_to_number(message.data) if complete else 0
-            self._answer(axis, data, complete, received_ns, interval_s)
-            if awaited:
-                timeout = max(0.0, deadline - time.monotonic())
-        for axis in awaited.values():
-            self._answer(axis, 0, False, time.perf_counter_ns(), interval_s)
-        if self._beats:
-            self._beats.send()
+            self._core["writer_reads"] = self.waits_for_writer
+        else:
+            raise SyncLostError(self._sync_patience_s)
 
-    def _begin(self) -> float:
-        """The SYNC; seconds since the one before, 0 for the first."""
-        sync_ns = self._sync.next()
-        interval = sync_ns - self._last_sync_ns if self._last_sync_ns else 0
-        if interval:
-            observe_ns(self.sync_interval, interval)
-            observe_ns(self.sync_error, abs(interval - self._period_ns))
-        self._last_sync_ns = sync_ns
-        return interval * 1e-9
+    def _serve_frames(self) -> None:
+        """Log the frames that compiled code could not, and dispatch those in the inbox."""
+        log = self._link.log
+        if log is not None:
+            for frame in self._unlogged.take():
+                received = bool(frame["flags"] & RECEIVED)
+                log(float(frame["time_s"]), to_message(frame, ""), received)
+        for frame in self._inbox.take():
+            self._link.dispatch(to_message(frame, ""))
 
-    def _answer(
-        self, axis: WallAxis, data: int, received: bool, received_ns: int, interval_s: float
-    ) -> None:
-        answer = step(axis.cycle, axis.row, data, received)
-        rpdo = self._rpdos[id(axis)]
-        answer |= axis.setup.rpdo.constant
-        rpdo.data[:] = number_to_data(answer, axis.setup.rpdo.length)
-        self._link.send(rpdo)
-        sent_ns = time.perf_counter_ns()
-        latency = sent_ns - received_ns
-        observe_ns(axis.latency, latency)
-        row = axis.row[0]
-        row["sync_interval_s"] = interval_s
-        row["latency_s"] = latency * 1e-9
-        if self._real_time:
-            observe_ns(axis.sync_to_rpdo, sent_ns - self._sync.deadline_ns + self._period_ns)
-            late = sent_ns > self._sync.deadline_ns
-            axis.late_rpdo += late
-            axis.late_in_a_row = axis.late_in_a_row + 1 if late else 0
-            self._check_late(axis)
-        put_row(axis.ring.header, axis.ring.rows, axis.row)
+    def _choose_log(self) -> None:
+        """Have frames logged as the link's are: into its ring directly, else by `_serve_frames`."""
+        core, log = self._core, self._link.log
+        owner = getattr(log, "__self__", None)
+        ring = owner if isinstance(owner, Ring) else self._unlogged
+        core["log_header"] = 0 if log is None else ring.header.ctypes.data
+        core["log"], core["log_length"] = ring.frames.ctypes.data, len(ring.frames)
+
+    def _choose_handling(self) -> None:
+        """Leave PDOs to the log alone that nobody in Python has subscribed to."""
+        subscribed = self._link.network.subscribers
+        if len(subscribed) != self._subscribed:
+            self._subscribed = len(subscribed)
+            handling = self._handling.copy()
+            for can_id in PDOS:
+                if not subscribed.get(can_id):
+                    handling[can_id] = Handling.LOG_ONLY
+            self._core["handling"] = handling
+
+    def _wait_for_writer(self) -> None:
+        deadline = time.monotonic() + _WRITER_PATIENCE_S
+        while self.waits_for_writer and self._record_is_behind():
+            time.sleep(0.001)
+            self.waits_for_writer = time.monotonic() < deadline
+
+    def _record_is_behind(self) -> bool:
+        return any(axis.ring.backlog() > cycle_core.BACKLOG for axis in self.axes)
+
+
+def _check_late(axis: WallAxis) -> None:
+    """Give the wall up whose RPDOs have come too late for too many cycles."""
+    most = axis.limits.late_cycles
+    if most and axis.late_in_a_row >= most:
+        axis.give_up(
+            f"RPDOs after the next SYNC for {axis.late_in_a_row} cycles, limits.late_cycles = "
+            f"{most}: the machine is too slow for bus.cycle_s"
+        )
+
+
+def _lay_out(axis: WallAxis) -> None:
+    """Fill the frames of an axis."""
+    drive, tpdo, rpdo = axis.frames, axis.setup.tpdo, axis.setup.rpdo
+    drive["tpdo_id"], drive["tpdo_length"] = tpdo.cob_id, tpdo.length
+    drive["rpdo_id"], drive["rpdo_length"] = rpdo.cob_id, rpdo.length
+    drive["constant"], drive["wrong_length"] = rpdo.constant, -1
+    for name, array in (
+        ("cycle", axis.cycle),
+        ("row", axis.row),
+        ("latency", axis.latency),
+        ("sync_to_rpdo", axis.sync_to_rpdo),
+        ("header", axis.ring.header),
+        ("rows", axis.ring.rows),
+    ):
+        drive[name] = array.ctypes.data
+
+
+def _handling(axes: Sequence[WallAxis]) -> NDArray[np.uint8]:
+    """Return how frames are handed over, by CAN-ID: those that may end a wall at once."""
+    handling = np.zeros(0x800, np.uint8)
+    handling[axes[0].setup.sync_cob_id] = Handling.URGENT
+    for axis in axes:
+        handling[EMCY + axis.node.node_id] = Handling.URGENT
+        handling[ERROR_CONTROL + axis.node.node_id] = Handling.URGENT_UNLESS_OPERATIONAL
+    return handling
+
+
+def error_control_periods_ns(watchdogs: Iterable[Watchdog]) -> dict[ErrorControlFrame, int]:
+    """Return the frames that these watchdogs wait for, and how often each is sent [ns].
+
+    Drives that consume the same heartbeat get it as often as the shortest one wants.
+    """
+    periods: dict[ErrorControlFrame, float] = {}
+    for watchdog in watchdogs:
+        frame = watchdog.error_control
+        if frame is not None:
+            periods[frame] = min(watchdog.period_s, periods.get(frame, watchdog.period_s))
+    return {frame: _ns(period) for frame, period in periods.items()}
+
+
+def _error_control_frames(watchdogs: Iterable[Watchdog]) -> NDArray[np.void]:
+    periods = error_control_periods_ns(watchdogs)
+    records = np.zeros(len(periods), cycle_core.ERROR_CONTROL)
+    for record, (frame, period_ns) in zip(records, periods.items(), strict=True):
+        record["can_id"] = frame.can_id | (CAN_RTR if frame.remote else 0)
+        record["length"], record["data"] = len(frame.data), data_to_number(frame.data)
+        record["period_ns"] = period_ns
+    return records
 
 
 def _warm_up(axis: WallAxis) -> None:
-    # What is compiled is loaded at its first call, which takes longer than many a cycle.
+    # What is compiled is loaded at its first call, which takes longer than many a cycle; the laws
+    # are called by address, and not by the core's own loading.
     cycle, row = axis.cycle.copy(), axis.row.copy()
     for phase in Phase:
         cycle["phase"] = phase
         step(cycle, row, 0, True)
         step(cycle, row, 0, False)
-    put_row(axis.ring.header.copy(), axis.ring.rows[:1].copy(), row)
-    observe_ns(axis.latency.copy(), 0)
+
+
+def _ns(seconds: float) -> int:
+    return round(seconds * 1e9)

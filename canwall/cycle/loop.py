@@ -30,6 +30,7 @@ from canwall.drive import (
     state_of,
 )
 from canwall.drive import objects as od
+from canwall.errors import RunFailedError
 from canwall.record import Phase
 
 #: Cycles within which a drive has to reach OPERATION ENABLED.
@@ -61,7 +62,7 @@ class Outcome:
     """What the drives would not do on the way out though they are disabled."""
 
 
-class _WallGivenUpError(Exception):
+class WallGivenUpError(RunFailedError):
     """The wall is given up; the text says why."""
 
 
@@ -76,7 +77,7 @@ def run_loop(
     stop is asked once a cycle; progress is told the cycle about every 100 ms of bus time.
     """
     outcome = Outcome()
-    loop = _Loop(exchange, stop, progress)
+    loop = Loop(exchange, stop, progress)
     # A collection would stop the cycle for milliseconds; nothing in it makes reference cycles.
     gc.collect()
     gc.freeze()
@@ -84,7 +85,7 @@ def run_loop(
     try:
         loop.enable()
         outcome.interrupted = loop.render(cycles)
-    except _WallGivenUpError as trip:
+    except WallGivenUpError as trip:
         outcome.trips.append(str(trip))
         outcome.trip_cycle = loop.j - 1
     except can.CanError as error:
@@ -102,7 +103,7 @@ def run_loop(
     return outcome
 
 
-def _leave(loop: "_Loop", outcome: Outcome) -> None:
+def _leave(loop: "Loop", outcome: Outcome) -> None:
     """By the cycle; where that failed, or a trip gave cause for doubt, by SDO; at last by NMT."""
     try:
         outcome.disabled = loop.leave()
@@ -125,12 +126,14 @@ def _leave(loop: "_Loop", outcome: Outcome) -> None:
         )
 
 
-class _Loop:
+class Loop:
+    """The parts of a run: enable, render, leave; whoever enables has to leave."""
+
     def __init__(
         self,
         exchange: Exchange,
-        stop: Callable[[], bool],
-        progress: Callable[[int], None],
+        stop: Callable[[], bool] = lambda: False,
+        progress: Callable[[int], None] = lambda j: None,
     ) -> None:
         self._exchange = exchange
         self._axes = exchange.axes
@@ -141,6 +144,7 @@ class _Loop:
 
     @property
     def j(self) -> int:
+        """Cycles so far."""
         return int(self._axes[0].cycle["j"][0])
 
     def _enter(self, phase: Phase) -> None:
@@ -164,16 +168,16 @@ class _Loop:
             for axis, way in zip(self._axes, ways, strict=True):
                 if way.gave_up:
                     returns = f"the fault comes back after every reset{latest_emergency(axis)}"
-                    raise _WallGivenUpError(self._say(axis, returns))
+                    raise WallGivenUpError(self._say(axis, returns))
                 if _is_silent(axis):
                     silent = f"no TPDO for {_SILENT_CYCLES} cycles while enabling"
-                    raise _WallGivenUpError(self._say(axis, silent))
+                    raise WallGivenUpError(self._say(axis, silent))
             self._exchange.cycle()
             self._check()
         for axis, way in zip(self._axes, ways, strict=True):
             if not _advance_enabling(axis, way):
                 stays = f"the drive stays in {shown_state(axis)}{latest_emergency(axis)}"
-                raise _WallGivenUpError(self._say(axis, stays))
+                raise WallGivenUpError(self._say(axis, stays))
 
     def _first_positions(self) -> None:
         waiting = list(self._axes)
@@ -186,7 +190,7 @@ class _Loop:
             if not waiting:
                 break
         else:
-            raise _WallGivenUpError(self._say(waiting[0], f"no TPDO within {patience} SYNCs"))
+            raise WallGivenUpError(self._say(waiting[0], f"no TPDO within {patience} SYNCs"))
         for axis in self._axes:
             start_at(axis.cycle, int(axis.cycle["counts"][0]))
 
@@ -244,13 +248,13 @@ class _Loop:
                 axis.delay = test.delay()
                 set_delay(axis.cycle, axis.settings, axis.delay)
             except ValueError as error:
-                raise _WallGivenUpError(self._say(test.axis, str(error))) from None
+                raise WallGivenUpError(self._say(test.axis, str(error))) from None
         return False
 
     def _check(self) -> None:
         for axis in self._axes:
             if axis.cycle["trip"][0]:
-                raise _WallGivenUpError(self._say(axis, trip_text(axis, self._exchange)))
+                raise WallGivenUpError(self._say(axis, trip_text(axis, self._exchange)))
 
     def leave(self) -> bool:
         """Zero torque and the state machines down; whether the drives confirmed it."""

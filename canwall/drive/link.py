@@ -56,15 +56,19 @@ class Link:
         self.network = _Network(self)
 
     def send(self, message: can.Message) -> None:
-        """Send and take note of it. Raises can.CanError."""
+        """Send and log a frame. Raises can.CanError."""
+        self.send_unlogged(message)
+        if self.log is not None:
+            self.log(time.time(), message, False)
+
+    def send_unlogged(self, message: can.Message) -> None:
+        """Send a frame. Raises can.CanError."""
         try:
             self.bus.send(message)
         except can.CanOperationError as error:
             if error.error_code != errno.ENOBUFS:
                 raise explained(error, self.bus) from None
             self._send_when_there_is_room(message)
-        if self.log is not None:
-            self.log(time.time(), message, False)
 
     def _send_when_there_is_room(self, message: can.Message) -> None:
         # python-can gives up at once: such a socket always seems ready to be written.
@@ -79,15 +83,20 @@ class Link:
                     raise explained(error, self.bus) from None
 
     def receive(self, timeout_s: float) -> can.Message | None:
-        """The next frame, or None if there is none within the time. Raises can.CanError."""
-        idle = self.idle
-        try:
-            message = self.bus.recv(timeout_s) if idle is None else self._receive_idling(timeout_s)
-        except can.CanOperationError as error:
-            raise explained(error, self.bus) from None
+        """Return and log the next frame; None if there is none in time. Raises can.CanError."""
+        message = self.receive_unlogged(timeout_s)
         if message is not None and self.log is not None:
             self.log(message.timestamp, message, True)
         return message
+
+    def receive_unlogged(self, timeout_s: float) -> can.Message | None:
+        """Return the next frame; None if there is none in time. Raises can.CanError."""
+        try:
+            if self.idle is None:
+                return self.bus.recv(timeout_s)
+            return self._receive_idling(timeout_s)
+        except can.CanOperationError as error:
+            raise explained(error, self.bus) from None
 
     def _receive_idling(self, timeout_s: float) -> can.Message | None:
         assert self.idle is not None

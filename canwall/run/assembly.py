@@ -10,11 +10,9 @@ from canwall.config import ConfigError, Settings
 from canwall.cycle import (
     BusMonitor,
     Exchange,
-    ExternalSync,
     Grant,
-    NativeExchange,
     Outcome,
-    PythonCanExchange,
+    SocketTransport,
     WallAxis,
     WallStage,
     real_time_machine,
@@ -78,17 +76,14 @@ def make_exchange(link: Link, axes: Sequence[WallAxis]) -> Exchange:
     external = settings.bus.sync == "external"
     if settings.bus.exchange != "python-can":
         try:
-            exchange = NativeExchange(link, axes, settings.real_time, external)
+            exchange = Exchange(link, axes, settings.real_time, external, SocketTransport)
             looks_s = _LOOKS_S if settings.real_time else _SIMULATED_LOOKS_S
             exchange.ahead = max(1, round(looks_s / settings.bus.cycle_s))
             return exchange
         except can.CanInitializationError as error:
             if settings.bus.exchange == "native":
                 raise ConfigError(f"bus.exchange = 'native': {error}") from None
-    sync = None
-    if external:
-        sync = ExternalSync(link, setup.sync_cob_id, settings.bus.cycle_s)
-    return PythonCanExchange(link, axes, settings.real_time, sync)
+    return Exchange(link, axes, settings.real_time, external)
 
 
 def make_monitor(link: Link, axes: Sequence[WallAxis]) -> BusMonitor:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from canwall import config, simdrive
 from canwall.config import Settings
-from canwall.cycle import PythonCanExchange, WallAxis, run_laws, step
+from canwall.cycle import Exchange, WallAxis, run_laws, step
 from canwall.cycle.state import start_at
 from canwall.drive import REQUIRED_OBJECTS, DriveNode, DriveSetup, Link, set_up
 from canwall.eds import load_eds
@@ -168,7 +168,7 @@ def _percentiles(durations_ns: NDArray[np.int64]) -> dict[str, float]:
 def _durations_of_canwall() -> NDArray[np.int64]:
     with _ready() as ready:
         ready.link.log = ready.axis.ring.log_frame
-        exchange = PythonCanExchange(ready.link, [ready.axis], real_time=False)
+        exchange = Exchange(ready.link, [ready.axis], real_time=False)
         for _ in range(_CYCLES):
             exchange.cycle()
         return _checked(ready)

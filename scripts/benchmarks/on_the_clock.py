@@ -13,9 +13,10 @@ import canopen
 import numpy as np
 from can.interfaces.virtual import VirtualBus
 from numpy.typing import NDArray
+from on_the_socket import enabled_axis
 
 from canwall import config
-from canwall.cycle import ProducedSync, real_time_priority, run_laws
+from canwall.cycle import Exchange, real_time_priority, run_laws
 from canwall.drive import Link
 from canwall.record import Ring
 from canwall.run import drive_dictionary, make_axis, make_exchange, on_the_bus
@@ -48,10 +49,10 @@ class _NotingBus(VirtualBus):
 
 def _ours() -> NDArray[np.float64]:
     with _NotingBus() as bus:
-        sync = ProducedSync(Link(bus), _SYNC_ID, 0, _PERIOD_S, real_time=True)
+        exchange = Exchange(Link(bus), [enabled_axis(True)], real_time=True)
         with real_time_priority():
             for _ in range(_SYNCS):
-                sync.next()
+                exchange.cycle()
         return bus.errors_us()
 
 

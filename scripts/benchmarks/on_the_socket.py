@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 from canwall import config
 from canwall.bus.socket_pair import SocketPairBus
 from canwall.cycle import (
-    NativeExchange,
+    Exchange,
+    SocketTransport,
     WallAxis,
     percentile_ns,
     real_time_priority,
@@ -123,7 +124,8 @@ def _against_drive(
     return np.frombuffer(out, np.int64).reshape(-1, 2)[1:]
 
 
-def _axis(real_time: bool) -> WallAxis:
+def enabled_axis(real_time: bool) -> WallAxis:
+    """Return an axis whose drive is enabled, by the C program's frames."""
     settings = config.load(
         config.shipped("config/sim.toml"),
         {
@@ -161,10 +163,10 @@ def _native(real_time: bool, axis: WallAxis, awake: bool = True) -> Callable[[so
         bus = _bus(sock)
         link = Link(bus)
         link.log = axis.ring.log_frame
-        exchange = NativeExchange(link, [axis], real_time)
+        exchange = Exchange(link, [axis], real_time, transport=SocketTransport)
         exchange.ahead = 20 if real_time else 1000
         if not awake:
-            exchange.look_ns = 0
+            exchange.transport.poll_ns = 0
         while (j := int(axis.cycle["j"][0])) < _CYCLES:
             exchange.cycle(min(exchange.ahead, _CYCLES - j))
         sync_interval[:] = exchange.sync_interval
@@ -179,7 +181,7 @@ def _native(real_time: bool, axis: WallAxis, awake: bool = True) -> Callable[[so
 
 
 def _the_usual_way(sock: socket.socket) -> None:
-    axis = _axis(False)
+    axis = enabled_axis(False)
     bus = _bus(sock)
     network = canopen.Network(bus)
     node = network.add_node(5, str(axis.settings.drive.eds))
@@ -258,7 +260,7 @@ def _round_trip(ends: Ends, ways: Sequence[str]) -> dict[str, Any]:
             for way in ways:
                 awake = way == "awake"
                 measure(f"c_copy, {way}", _c_master(program, awake), awake)
-                measure(f"native, {way}", _native(False, _axis(False), awake), awake)
+                measure(f"native, {way}", _native(False, enabled_axis(False), awake), awake)
                 measure(f"usual_way, drive {way}", _the_usual_way, awake)
 
     def ratios(one: str, other: str) -> dict[str, Any]:
@@ -359,7 +361,7 @@ def under_python() -> dict[str, Any]:
     """TPDO → RPDO at 1 kHz in real time, with and without Python threads that hold the lock."""
 
     def measured() -> dict[str, float]:
-        axis = _axis(True)
+        axis = enabled_axis(True)
         master = _native(True, axis)
         with real_time_priority():
             seen = _against_drive(program, master, awake=False)

@@ -1,4 +1,4 @@
-"""One cycle's frames over python-can: what is late, short, missing or slow, and the SYNC's grid."""
+"""One cycle's frames by both transports: late, short, missing or slow, and the SYNC's grid."""
 
 import time
 from types import SimpleNamespace
@@ -9,7 +9,8 @@ import pytest
 from rig import RPDO1, SYNC, TPDO1, Loop, Rig, RigFactory
 
 from canwall.cycle import exchange as exchange_module
-from canwall.cycle import sync as sync_module
+from canwall.cycle import python_can as python_can_module
+from canwall.cycle.core import SPIN_NS
 from canwall.record.ring import FRAMES
 
 PERIOD_NS = 1_000_000
@@ -133,9 +134,7 @@ def test_simulated_time_waits_for_the_writer_of_the_record(
     assert len(naps) == 3
 
 
-def test_writer_that_is_gone_is_not_waited_for_for_ever(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_dead_writer_is_not_waited_for_for_ever(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     loop = Loop(rig)
     loop.ring.header["frame_head"] = FRAMES
     slept: list[float] = []
@@ -178,21 +177,21 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
     time_of_the_clock = fake_time(perf_counter_ns=clock.perf_counter_ns, sleep=clock.sleep)
     monkeypatch.setattr(exchange_module, "time", time_of_the_clock)
-    monkeypatch.setattr(sync_module, "time", time_of_the_clock)
+    monkeypatch.setattr(python_can_module, "time", time_of_the_clock)
     return clock
 
 
 def syncs(loop: Loop, clock: Clock, cycle_takes_ns: list[int]) -> list[float]:
     """Instants of the SYNCs in periods since the first; each cycle takes as long as given."""
     instants: list[int] = []
-    send = loop.rig.link.send
+    send = loop.rig.link.send_unlogged
 
     def noting(message: can.Message) -> None:
         if message.arbitration_id == SYNC:
             instants.append(clock.now_ns)
         send(message)
 
-    loop.rig.link.send = noting  # type: ignore[method-assign]
+    loop.rig.link.send_unlogged = noting  # type: ignore[method-assign]
     for duration in cycle_takes_ns:
         loop.exchange.cycle()
         clock.now_ns += duration
@@ -202,7 +201,7 @@ def syncs(loop: Loop, clock: Clock, cycle_takes_ns: list[int]) -> list[float]:
 @over_python_can
 def test_syncs_keep_to_absolute_deadlines(rig: Rig, clock: Clock) -> None:
     loop = Loop(rig, real_time=True)
-    clock.oversleep_ns = sync_module.SPIN_NS + 60_000
+    clock.oversleep_ns = SPIN_NS + 60_000
     durations = [100_000 * (j % 7) for j in range(50)]
     instants = syncs(loop, clock, durations)
     # Each is late by what the sleep took too long, and none passes it on to the next.
@@ -213,7 +212,7 @@ def test_syncs_keep_to_absolute_deadlines(rig: Rig, clock: Clock) -> None:
 @over_python_can
 def test_sleep_that_is_a_little_too_long_makes_no_sync_late(rig: Rig, clock: Clock) -> None:
     loop = Loop(rig, real_time=True)
-    clock.oversleep_ns = sync_module.SPIN_NS - 10_000
+    clock.oversleep_ns = SPIN_NS - 10_000
     assert syncs(loop, clock, [0] * 20) == pytest.approx(range(20), abs=1e-3)
 
 
@@ -227,14 +226,14 @@ def test_late_cycle_is_not_made_up_for_by_a_burst(rig: Rig, clock: Clock) -> Non
 @over_python_can
 def test_rpdo_after_the_next_sync_was_due_is_late(rig: Rig, clock: Clock) -> None:
     loop = Loop(rig, real_time=True)
-    send = rig.link.send
+    send = rig.link.send_unlogged
 
     def slow(message: can.Message) -> None:
         send(message)
         if message.arbitration_id == RPDO1 and loop.record["j"][0] == 3:
             clock.now_ns += 1_100_000
 
-    rig.link.send = slow  # type: ignore[method-assign]
+    rig.link.send_unlogged = slow  # type: ignore[method-assign]
     for _ in range(6):
         loop.exchange.cycle()
     assert loop.axis.late_rpdo == 1

@@ -4,10 +4,6 @@ import can
 import pytest
 from rig import SYNC, Loop, Rig, RigFactory, settings_with
 
-from canwall.cycle import ExternalSync, ProducedSync
-from canwall.cycle.sync import SyncLostError
-from canwall.drive import Link
-
 
 def sent_by(rig: Rig) -> list[bytes]:
     return [data for can_id, data in rig.frames if can_id == SYNC]
@@ -85,18 +81,3 @@ def test_producer_that_falls_silent_ends_the_run(make_rig: RigFactory) -> None:
     assert outcome.trips[0] == "the bus failed: no SYNC from its producer for 0.1 s"
     assert outcome.disabled  # over SDO
     assert rig.node.read(0x6041) & 0x6F == 0x40
-
-
-def test_grid_of_the_produced_sync_begins_with_its_first(make_rig: RigFactory) -> None:
-    rig = make_rig()
-    sync = ProducedSync(rig.link, SYNC, 0, 0.001, real_time=True)
-    first = sync.next()
-    assert sync.deadline_ns - first == pytest.approx(1_000_000, abs=100_000_000)
-
-
-def test_external_sync_that_never_comes() -> None:
-    with (
-        can.Bus(interface="virtual", channel="no sync") as bus,
-        pytest.raises(SyncLostError, match=r"for 0\.5 s"),
-    ):
-        ExternalSync(Link(bus), SYNC, 0.05).next()

@@ -1,10 +1,11 @@
 """Enabling from every state, faults that return, and what is said when it does not come about."""
 
 import pytest
+import rig as rigs
 from rig import Rig, RigFactory, settings_with
 
+from canwall.cycle import Loop, WallGivenUpError
 from canwall.drive import DriveError, DriveState, Enabling, disable, state_of, status_text
-from canwall.drive.trial import Trial
 
 HALT = 1 << 8
 FAULT, SWITCH_ON_DISABLED, ENABLED = 0x0218, 0x0250, 0x0237
@@ -22,8 +23,8 @@ def rig(make_rig: RigFactory) -> Rig:
     return make_rig(settings_with({"drive.wait_s": 0.0}))
 
 
-def trial_of(rig: Rig) -> Trial:
-    return Trial(rig.node, rig.set_up(), 0.0)
+def loop_of(rig: Rig) -> Loop:
+    return Loop(rigs.Loop(rig).exchange)
 
 
 @pytest.mark.parametrize("start", STARTS)
@@ -32,19 +33,19 @@ def test_from_every_state_that_a_predecessor_has_left(rig: Rig, start: str) -> N
     for word in STARTS[start]:
         rig.node.write(0x6040, 0, word)
     rig.node.write(0x6071, 0, 300)
-    trial = trial_of(rig)
+    loop = loop_of(rig)
     assert state_of(rig.node.read(0x6041)) is DriveState.SWITCH_ON_DISABLED
-    trial.enable()
+    loop.enable()
     assert state_of(rig.node.read(0x6041)) is DriveState.OPERATION_ENABLED
     assert rig.node.read(0x6040) == 0x0F
     assert rig.node.read(0x6077) == rig.node.read(0x6071) == 0
-    trial.disable()
+    assert loop.leave()
     assert state_of(rig.node.read(0x6041)) is DriveState.SWITCH_ON_DISABLED
 
 
 def test_from_fault(rig: Rig) -> None:
-    trial = trial_of(rig)
-    trial.enable()
+    loop = loop_of(rig)
+    loop.enable()
     rig.node.write(0x6007, 0, 1)
     rig.node.command("PRE-OPERATIONAL")
     while state_of(rig.node.read(0x6041)) is not DriveState.FAULT:
@@ -52,7 +53,7 @@ def test_from_fault(rig: Rig) -> None:
     disable(rig.node)  # the fault stays: its reset belongs to enabling
     assert state_of(rig.node.read(0x6041)) is DriveState.FAULT
     rig.node.command("OPERATIONAL")
-    trial.enable()
+    loop.enable()
 
 
 def test_fault_that_returns_is_given_up() -> None:
@@ -91,20 +92,20 @@ def faulty(rig: Rig, statuswords: list[int]) -> None:
 
 
 def test_fault_that_returns_on_the_bus(rig: Rig) -> None:
-    trial = trial_of(rig)
+    loop = loop_of(rig)
     faulty(rig, [FAULT, SWITCH_ON_DISABLED])
-    with pytest.raises(DriveError, match="the fault comes back after every reset: FAULT"):
-        trial.enable()
+    with pytest.raises(WallGivenUpError, match="the fault comes back after every reset"):
+        loop.enable()
 
 
 def test_state_that_stays_is_named_with_its_bits(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    trial = trial_of(rig)
-    monkeypatch.setattr("canwall.drive.trial._STATE_S", 0.02)
+    loop = loop_of(rig)
+    monkeypatch.setattr("canwall.cycle.loop._ENABLE_CYCLES", 20)
     faulty(rig, [0x0A31])
     with pytest.raises(
-        DriveError, match=r"READY TO SWITCH ON.*0x0a31: voltage enabled, remote, int"
+        WallGivenUpError, match=r"READY TO SWITCH ON.*0x0a31: voltage enabled, remote, int"
     ):
-        trial.enable()
+        loop.enable()
 
 
 def test_drive_that_stays_enabled(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -132,5 +133,5 @@ def test_target_torque_that_is_not_zeroed(rig: Rig) -> None:
         ),
     ],
 )
-def test_status_for_people(statusword: int, text: str) -> None:
+def test_status_in_words(statusword: int, text: str) -> None:
     assert status_text(statusword) == text

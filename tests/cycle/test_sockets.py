@@ -1,4 +1,4 @@
-"""What only the native exchange has: several cycles at a time, its grid in compiled code, errno."""
+"""The socket transport: several cycles at a time, time stamps, a bus that fails, by errno."""
 
 import errno
 import os
@@ -9,15 +9,12 @@ from collections.abc import Callable
 import can
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from rig import RPDO1, TPDO1, Loop, RigFactory, settings_with
 
 from canwall.bus.cycle_socket import CycleSocket
 from canwall.bus.socket_pair import SocketPairBus
 from canwall.config import Settings
-from canwall.cycle import NativeExchange
-from canwall.cycle.native_cycle import next_deadline
+from canwall.cycle.sockets import SocketTransport
 from canwall.record import TIMING_COLUMNS, Phase
 
 PRESSING = 500
@@ -64,23 +61,8 @@ def test_frames_of_others_reach_the_network_between_many_cycles(make_rig: RigFac
     assert (0x300, b"\x07") in loop.rig.frames
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
-@given(
-    deadline=st.integers(0, 10**15),
-    late=st.integers(-(10**9), 10**10),
-    period=st.integers(1, 10**9),
-)
-def test_grid_of_deadlines(make_rig: RigFactory, deadline: int, late: int, period: int) -> None:
-    now = deadline + late
-    following = next_deadline(deadline, now, period)
-    assert (following - deadline) % period == 0
-    assert following > max(now, deadline)
-    assert following - max(now, deadline) <= period
-
-
 def test_real_time_keeps_to_the_grid_of_its_first_sync(make_rig: RigFactory) -> None:
     loop = Loop(make_rig(pressing()), real_time=True)
-    assert isinstance(loop.exchange, NativeExchange)
     deadlines = []
     for _ in range(20):
         loop.exchange.cycle()
@@ -111,9 +93,9 @@ def test_latency_begins_with_the_arrival_of_the_tpdo(make_rig: RigFactory) -> No
 
 def breaking(loop: Loop, cycles: int | None) -> Callable[[int], bool]:
     """From PRESSING on, for so many cycles, the cycle has a descriptor that is none."""
-    exchange = loop.exchange
-    assert isinstance(exchange, NativeExchange)
-    cycle, descriptor = exchange.cycle, exchange.descriptor
+    exchange, transport = loop.exchange, loop.exchange.transport
+    assert isinstance(transport, SocketTransport)
+    cycle, descriptor = exchange.cycle, transport.descriptor
     broken = socket.socket()
     broken.close()
     failures = 0
@@ -122,7 +104,7 @@ def breaking(loop: Loop, cycles: int | None) -> Callable[[int], bool]:
         nonlocal failures
         fails = loop.record["j"][0] >= PRESSING and (cycles is None or failures < cycles)
         failures += fails
-        exchange.descriptor = -1 if fails else descriptor
+        transport.descriptor = -1 if fails else descriptor
         cycle(most)
 
     exchange.cycle = failing  # type: ignore[method-assign]

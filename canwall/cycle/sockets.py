@@ -1,0 +1,189 @@
+"""Transport over a socket, compiled: SocketCAN, `unixcan`, a socket pair; no interpreter lock."""
+
+from collections.abc import Callable
+from typing import Any
+
+import can
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from canwall.bus import CycleSocket, bus_error
+from canwall.bus.raw_socket import (
+    CLOSED,
+    FAILED,
+    FRAME,
+    PORT,
+    CFunction,
+    now_ns,
+    place_port,
+    receive,
+    send,
+    sleep_until,
+    wait_readable,
+)
+from canwall.compiled import Record, compiled
+from canwall.cycle.core import Want, proceed, take
+from canwall.cycle.transport import CycleFrames
+from canwall.drive import Link
+
+#: A drive that answers within this time after it was asked is polled for, which costs less than a
+#: sleep.
+POLL_NS = 30_000
+#: A full transmit buffer is waited for no longer than this in simulated time, and so much of a
+#: cycle in real time.
+_SEND_PATIENCE_S, _SEND_SHARE = 1.0, 0.2
+
+#: Why `_run` returns besides a `Want`: the idle function is to be called in Python; the other side
+#: has closed; a call failed with `errno` in the port.
+_IDLE, _GONE, _ERRNO = 100, 101, 102
+_SEND, _FRAME, _DRAIN, _SLEEP, _SPIN = map(
+    int, (Want.SEND, Want.FRAME, Want.DRAIN, Want.SLEEP, Want.SPIN)
+)
+
+SOCKET = np.dtype(
+    [
+        ("port", PORT, (1,)),
+        ("descriptor", "i8"),
+        ("stamped", "?"),
+        ("send_patience_ns", "i8"),
+        ("poll_ns", "i8"),
+        # A drive that is served in idle time: by Python, or by a C function at an address.
+        ("idle", "?"),
+        ("idled", "?"),  # in Python, since the socket was last looked at
+        ("idle_function", "u8"),
+        ("idle_state", "u8"),
+    ],
+    align=True,
+)
+
+
+class SocketTransport:
+    """Moves the frames of a cycle over the socket of a bus, or one beside it (`CycleSocket`)."""
+
+    name = "native"
+
+    def __init__(self, link: Link, core: NDArray[np.void], frames: CycleFrames) -> None:
+        """Open the socket.
+
+        Raises:
+            can.CanInitializationError: the bus has no such socket.
+        """
+        self._link = link
+        self._core = core
+        self._cycle_socket = CycleSocket(
+            link.bus, frames.received, frames.sent, stamps=frames.real_time
+        )
+        self._socket = np.zeros(1, SOCKET)
+        place_port(self._socket["port"][0])
+        self._socket["descriptor"] = self._cycle_socket.descriptor
+        self._socket["stamped"] = self._cycle_socket.stamped
+        patience_s = _SEND_SHARE * frames.period_s if frames.real_time else _SEND_PATIENCE_S
+        self._socket["send_patience_ns"] = round(patience_s * 1e9)
+        self._socket["poll_ns"] = POLL_NS
+
+    @property
+    def poll_ns(self) -> int:
+        """How long frames are polled for before the wait is a sleep [ns]."""
+        return int(self._socket["poll_ns"][0])
+
+    @poll_ns.setter
+    def poll_ns(self, poll_ns: int) -> None:
+        self._socket["poll_ns"] = poll_ns
+
+    @property
+    def descriptor(self) -> int:
+        """Descriptor that the frames of the cycle go through."""
+        return int(self._socket["descriptor"][0])
+
+    @descriptor.setter
+    def descriptor(self, descriptor: int) -> None:
+        self._socket["descriptor"] = descriptor
+
+    def run(self) -> Want:
+        """Move frames until Python is wanted. Raises can.CanError where the bus fails."""
+        link, socket = self._link, self._socket
+        socket["idle"], socket["idled"] = link.idle is not None, False
+        socket["idle_function"], socket["idle_state"] = link.compiled_idle or CFunction(0, 0)
+        while (result := _run(self._core, socket)) == _IDLE:
+            idle: Callable[[], None] | None = link.idle
+            assert idle is not None
+            idle()
+        if result == _GONE:
+            if self._cycle_socket.renew():
+                self.descriptor = self._cycle_socket.descriptor
+            raise can.CanOperationError("the other side of the bus has gone")
+        if result == _ERRNO:
+            raise bus_error(int(socket["port"]["errno"][0, 0]), link.bus)
+        return Want(result)
+
+    def finish_cycle(self) -> None:
+        """Hand over what came to the bus beside the socket of the cycle."""
+        if self._cycle_socket.own:
+            while self._link.serve(0.0):
+                pass
+
+    def close(self) -> None:
+        """Close the socket of the cycle, where it has one of its own."""
+        self._cycle_socket.close()
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _call_idle(typingctx: Any, address: Any, state: Any) -> Any:
+    """Whether the compiled idle function at `address` did all that there was to be done."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        number = ir.IntType(64)
+        function = ir.FunctionType(number, [number]).as_pointer()
+        return builder.call(builder.inttoptr(arguments[0], function), [arguments[1]])
+
+    return types.int64(types.uint64, types.uint64), codegen
+
+
+@compiled
+def _run(cores: NDArray[np.void], sockets: NDArray[np.void]) -> int:
+    """Do what the core wants until that is something of Python's; a `Want`, or as above."""
+    core: Record = cores[0]
+    socket: Record = sockets[0]
+    port = socket.port[0]
+    asked_ns = now_ns(port)
+    want = _FRAME if socket.idled else proceed(cores, asked_ns)
+    socket.idled = False
+    while True:
+        if want == _SEND:
+            out = core.out
+            patience_ns = socket.send_patience_ns
+            if send(port, socket.descriptor, out[0], out[1], out[2], patience_ns) != FRAME:
+                return _ERRNO
+            asked_ns = now_ns(port)
+            want = proceed(cores, asked_ns)
+        elif want in (_FRAME, _DRAIN):
+            came = receive(port, socket.descriptor, socket.stamped)
+            if came == FRAME:
+                frame = port.frame[0]
+                want = take(
+                    cores, frame.can_id, frame.length, frame.data, now_ns(port), port.stamp_ns
+                )
+            elif came == CLOSED:
+                return _GONE
+            elif came == FAILED:
+                return _ERRNO
+            elif want == _DRAIN or now_ns(port) >= core.until_ns:
+                want = proceed(cores, now_ns(port))
+            elif socket.idle:
+                if not (
+                    socket.idle_function and _call_idle(socket.idle_function, socket.idle_state)
+                ):
+                    socket.idled = True
+                    return _IDLE
+            elif now_ns(port) - asked_ns > socket.poll_ns:
+                wait_readable(port, socket.descriptor, core.until_ns - now_ns(port))
+        elif want == _SLEEP:
+            sleep_until(port, core.until_ns)
+            want = proceed(cores, now_ns(port))
+        elif want == _SPIN:
+            want = proceed(cores, now_ns(port))
+        else:
+            return want
