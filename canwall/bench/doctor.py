@@ -1,4 +1,4 @@
-"""The doctor: finds the drive, says how it would be set up and why, and tests its watchdog.
+"""The doctor: finds the drive, explains how it would be set up, and tests its watchdog.
 
 The drive is set up as for a run, enabled with zero torque for the test, disabled, and everything
 that was changed is put back.
@@ -25,7 +25,7 @@ from canwall.run import make_exchange
 
 #: Seconds of a living master before it falls silent: some drives watch from the second sign on.
 _ALIVE_S = 0.2
-#: Beyond its time by this much, the watchdog is taken for one that does not work.
+#: A watchdog that is later than its time by this much does not work.
 _LATE_S = 0.5
 
 
@@ -41,13 +41,13 @@ class Finding:
 
 @dataclass
 class Findings:
-    """What the doctor found, in order."""
+    """Findings in their order."""
 
     lines: list[Finding] = field(default_factory=list)
 
     @property
     def well(self) -> bool:
-        """Whether a run may be tried."""
+        """True if a run may be tried."""
         return all(line.well for line in self.lines)
 
     def add(self, section: str, what: str, found: str, well: bool = True) -> None:
@@ -62,7 +62,7 @@ def examine(
     announce: Callable[[str], None],
     findings: Findings,
 ) -> None:
-    """Fill the findings; announce is told what is about to be done to the drive.
+    """Examine the drive; announce gets each step before it is done.
 
     Whatever happens, torque is zero, the drive is disabled and put back at the end. Raises
     DriveError where the drive cannot be set up or does not follow, can.CanError.

@@ -1,8 +1,8 @@
-"""What moves CAN frames, whoever sends them: buses, raw sockets for compiled code, bus errors.
+"""Buses and sockets that move CAN frames, for master and slave alike, and their errors.
 
 `unixcan` is a python-can interface between processes and `socket_pair` one with two ends in a
 process; `raw_socket` moves frames over a descriptor from compiled code, `cycle_socket` finds that
-descriptor for a bus. `can_ids` has the identifiers of CiA 301. Nothing here knows what frames say.
+descriptor for a bus. `can_ids` has the identifiers of CiA 301. Nothing here reads a frame's data.
 """
 
 from canwall.bus.cycle_socket import CycleSocket

@@ -34,7 +34,7 @@ class FrameSocket(Protocol):
 
 
 class CycleSocket:
-    """What compiled code sends to and receives from."""
+    """Socket that compiled code sends to and receives from."""
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class CycleSocket:
 
     @property
     def own(self) -> bool:
-        """Whether it is a socket beside that of the bus."""
+        """True if it is a socket beside that of the bus."""
         return self._own is not None
 
     def _borrow(self) -> None:
@@ -92,7 +92,7 @@ class CycleSocket:
                 self.stamped = True
 
     def renew(self) -> bool:
-        """Look again after the other side has gone; whether there is somebody to talk to."""
+        """Look for the socket again after the peer has closed it; return whether there is one."""
         if self._own is not None:
             return False
         assert isinstance(self._bus, FrameSocket)
@@ -103,7 +103,7 @@ class CycleSocket:
         return True
 
     def close(self) -> None:
-        """Close it if it is not that of the bus, which gets its frames back."""
+        """Close a socket beside that of the bus, and give the bus its frames back."""
         if self._own is not None:
             self._own.close()
             self._own = None
@@ -128,7 +128,7 @@ def _open(channel: str, received: Iterable[int]) -> socket.socket:
 
 
 def _leave_out(bus: Any, can_ids: Iterable[int]) -> None:
-    """Let a SocketCAN bus hear all but these, and no error frames."""
+    """Filter these frames, and error frames, out of a SocketCAN bus."""
     filters = b"".join(
         struct.pack("=II", can_id | _INVERTED, _STANDARD | _EFF | _RTR)
         for can_id in sorted(can_ids)

@@ -1,4 +1,4 @@
-"""What the system says of a bus that fails, in words: what, where, what to do."""
+"""Errors of a bus in one line: what, where, what to do."""
 
 import errno
 import os
@@ -9,7 +9,7 @@ import can
 _WORDS = {
     errno.ENETDOWN: "{channel} is down; as root: ip link set {channel} up",
     errno.ENODEV: "there is no interface {channel}; `ip link` shows which there are",
-    errno.ENXIO: "the interface {channel} is gone; plug the adapter in, and start again",
+    errno.ENXIO: "the interface {channel} has disappeared; plug the adapter in, and start again",
     errno.ENOBUFS: "the transmit queue of {channel} stays full: does anybody acknowledge, at this "
     "bit rate? Is there too much on the bus, or the interface's txqueuelen below what is sent in a "
     "cycle? (ip link set {channel} txqueuelen 100)",
@@ -21,19 +21,19 @@ _WORDS = {
 
 
 def reason(number: int, channel: str) -> str:
-    """An errno of a bus in words; channel is that of `[bus]`."""
+    """Describe an errno; channel is that of `[bus]`."""
     words = _WORDS.get(number)
     return os.strerror(number) if words is None else words.format(channel=channel)
 
 
 def bus_error(number: int, bus: can.BusABC) -> can.CanOperationError:
-    """An errno of a bus as what is raised."""
+    """Return the exception to raise for an errno of a bus."""
     channel = getattr(bus, "channel", None)
     text = reason(number, channel if isinstance(channel, str) else bus.channel_info)
     return can.CanOperationError(text, None if number in _WORDS else number)
 
 
 def explained(error: can.CanOperationError, bus: can.BusABC) -> can.CanOperationError:
-    """What python-can has raised, in these words where there are any."""
+    """Rephrase an error of python-can where its errno is known."""
     number = error.error_code
     return error if number is None or number not in _WORDS else bus_error(number, bus)

@@ -1,4 +1,4 @@
-"""One drive with its wall, as the loop sees it; several may share a SYNC."""
+"""One drive with its wall; several may share a SYNC."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -27,7 +27,7 @@ class WallStage:
 
 @dataclass
 class WallAxis:
-    """A drive that is set up, its wall, and where its rows go."""
+    """A drive that is set up, its wall, and the ring that takes its rows."""
 
     node: DriveNode
     setup: DriveSetup
@@ -35,17 +35,17 @@ class WallAxis:
     laws: Sequence[Law]
     ring: Ring
     changes: list[WallStage] = field(default_factory=list)
-    #: What other processes want changed while the wall is rendered.
+    #: Changes of the wall that other processes ask for.
     mailbox: Mailbox | None = None
-    #: Why the wall was given up, where it is something that came beside the cycle.
+    #: Reason to give up the wall that came from outside the cycle; empty: there is none.
     reported: str = ""
-    #: The next of the walls that take turns, counted from the first on.
+    #: Number of the next wall of those that take turns.
     next_turn: int = 1
 
     def __post_init__(self) -> None:
         self.cycle: NDArray[np.void] = make_cycle(self.settings, self.setup, self.laws)
         self.row = np.zeros(1, ROW)
-        #: Its frames and their lateness, of dtype DRIVE_FRAMES; where the exchange has put them.
+        #: Its frames and their lateness, dtype DRIVE_FRAMES, a view of the exchange's array.
         self.frames = np.zeros(1, DRIVE_FRAMES)
         #: From a TPDO to its RPDO, and from the instant at which the SYNC was due to the RPDO.
         self.latency, self.sync_to_rpdo = np.zeros(1, HISTOGRAM), np.zeros(1, HISTOGRAM)
@@ -56,12 +56,12 @@ class WallAxis:
 
     @property
     def name(self) -> str:
-        """How messages call it."""
+        """Name of the drive in messages."""
         return f"node {self.node.node_id}"
 
     @property
     def active(self) -> bool:
-        """Whether there may be a torque: the wall is rendered, or the delay measured."""
+        """True while there may be a torque: the wall is rendered, or the delay measured."""
         return int(self.cycle["phase"][0]) in (Phase.RENDERING, Phase.MEASURING)
 
     @property
@@ -71,7 +71,7 @@ class WallAxis:
 
     @property
     def late_in_a_row(self) -> int:
-        """Those since the last one in time."""
+        """Late RPDOs since the last one in time."""
         return int(self.frames["late_in_a_row"][0])
 
     @property
@@ -81,9 +81,9 @@ class WallAxis:
         return length if length >= 0 else None
 
     def give_up(self, text: str) -> None:
-        """End the wall for something that came beside the cycle; the first such thing counts.
+        """End the wall because of something outside the cycle; the first reason counts.
 
-        Nothing is given up before there may be a torque, nor while the wall is being left.
+        Ignored before there may be a torque, and while the wall is being left.
         """
         if self.active and not self.cycle["trip"][0]:
             self.reported = text
@@ -91,7 +91,7 @@ class WallAxis:
 
     @property
     def measures_delay(self) -> bool:
-        """Whether the delay is to be measured before the wall is rendered."""
+        """True if the delay has to be measured before the wall is rendered."""
         estimator = self.settings.estimator
         known = estimator.delay_cycles is not None or self.setup.synchronous
         return estimator.measure_delay or not known

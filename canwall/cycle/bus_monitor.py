@@ -1,4 +1,4 @@
-"""What comes over the bus beside the cycle and ends it: EMCY, NMT state, bus-off, another SYNC."""
+"""Frames beside the cycle that end a wall: EMCY, another NMT state, bus-off, a second SYNC."""
 
 from collections.abc import Sequence
 
@@ -16,13 +16,13 @@ _BUS_OFF = 0x40
 
 
 class BusMonitor:
-    """Turns such frames into trips of the axis that they are about, in the cycle that they come.
+    """Turns such frames into trips of the axis that they concern, in the cycle in which they come.
 
-    Nothing is tripped before the wall is rendered, nor while it is being left.
+    Nothing trips before the wall is rendered, or while it is being left.
     """
 
     def __init__(self, link: Link, axes: Sequence[WallAxis], sync_cob_id: int | None) -> None:
-        """Listen. `sync_cob_id` is that of the SYNC if nobody else may send one, else None."""
+        """Subscribe. sync_cob_id: that of the SYNC if nobody else may send one, else None."""
         self._axes = axes
         self.error_frames = 0
         self.notes: list[str] = []
@@ -40,7 +40,8 @@ class BusMonitor:
         if not axis.active or len(data) < 3 or code == 0:
             return
         error = EmcyError(code, data[2], bytes(data[3:]), timestamp)
-        text = f"EMCY {code:#06x} ({error.get_desc() or 'of the maker'}), register {data[2]:#04x}"
+        meaning = error.get_desc() or "manufacturer-specific"
+        text = f"EMCY {code:#06x} ({meaning}), register {data[2]:#04x}"
         if axis.settings.limits.emergency == "trip":
             axis.give_up(text)
         else:

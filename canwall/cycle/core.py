@@ -43,7 +43,7 @@ _ID_BITS = CAN_ERR - 1
 
 
 class Want(IntEnum):
-    """What the core wants of its transport, or of Python."""
+    """Request of the core to its transport, or to Python."""
 
     SEND = 0
     """Send the frame in `out`, then `proceed`."""
@@ -75,7 +75,7 @@ _BEFORE, _DRAINING, _SYNC_DUE, _SYNC_SENT, _SYNC_AWAITED, _TPDO_AWAITED, _RPDO_S
 
 
 class Handling(IntEnum):
-    """How a frame that is not the cycle's own is handed over, by its CAN-ID."""
+    """Hand-over of a frame that is not the cycle's own, by its CAN-ID."""
 
     BETWEEN_CYCLES = 0
     URGENT = 1
@@ -445,7 +445,7 @@ def _hand_over(core: Record, wall_ns: int, can_id: int, length: int, data: int) 
 
 @compiled
 def _record_is_behind(core: Record) -> bool:
-    """Whether the writer of the record has to be waited for, which only simulated time can."""
+    """Return whether the writer of the record is behind; only simulated time can wait for it."""
     if core.real_time or not core.writer_reads:
         return False
     drives = elements(core.drives, core.drives_length, DRIVE_FRAMES)
@@ -460,7 +460,7 @@ def _record_is_behind(core: Record) -> bool:
 
 @compiled
 def _wants_python(core: Record) -> bool:
-    """Whether Python has something to do before the next cycle: a trip, a strike's end, frames."""
+    """Return whether Python is due before the next cycle: a trip, a strike's end, frames."""
     inbox: Record = elements(core.inbox_header, 1, HEADER)[0]
     if inbox.frame_head != inbox.frame_tail:
         return True

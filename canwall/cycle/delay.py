@@ -1,9 +1,9 @@
-"""The delay D of the loop, measured: from the sampling of a position to its torque taking effect.
+"""Measurement of the delay D of the loop, from the sample of a position to its torque.
 
-A drive does not say it. So the motor is shaken by small torques in pairs, one way and back, of
-random sign, and D is found in how the position follows: as that D, mass, friction and spring with
-which the exact motion under these torques comes closest to it. What is compared is the position
-less its moving average, in which a hand that moves slowly does not show.
+Drives do not report it. Small torques in pairs, one way and back, of random sign, excite the motor;
+D, mass, friction and spring are fitted so that the exact motion under these torques comes closest
+to the measured one. Positions are compared after subtraction of their moving average, which
+removes the slow motion of a hand.
 """
 
 import math
@@ -34,7 +34,7 @@ _LONGEST, _AVERAGED = 8, 33
 
 
 class DelayTest:
-    """Shakes one axis and listens."""
+    """Excitation of one axis, and its response."""
 
     def __init__(self, axis: WallAxis) -> None:
         settings = axis.settings
@@ -50,18 +50,18 @@ class DelayTest:
         self._forces: list[float] = []
 
     def excite(self) -> None:
-        """Set the torque of the coming cycle."""
+        """Set the torque of the next cycle."""
         k = len(self._positions)
         self.axis.cycle["test_per_mille"] = self._torques[k] if k < self.cycles else 0
 
     def note(self) -> None:
-        """Take note of the cycle that is over."""
+        """Store position and torque of the last cycle."""
         row = self.axis.row[0]
         self._positions.append(float(row["position_rad"]) if row["received"] else math.nan)
         self._forces.append(float(row["torque_cmd"]))
 
     def delay(self) -> float:
-        """D in periods. Raises ValueError where the motion does not tell."""
+        """Return D in periods. Raises ValueError where the torques do not explain the motion."""
         settings = self.axis.settings
         return measured_delay(
             np.array(self._positions),
@@ -72,9 +72,9 @@ class DelayTest:
 
 
 def excitation(cycles: int, length: int) -> NDArray[np.int64]:
-    """Signs of the torque, shape (cycles,): pairs that give the handle no lasting speed.
+    """Return signs of the torque, shape (cycles,), in pairs that leave the handle no speed.
 
-    Each torque of a pair lasts for `length` cycles; a pair that would not be complete is none.
+    Each torque of a pair lasts for `length` cycles; an incomplete pair at the end is left out.
     """
     signs = np.random.default_rng(_SEED).choice([-1, 1], size=cycles // (2 * length))
     pairs = np.stack([signs, -signs], axis=1).reshape(-1).repeat(length)
@@ -82,10 +82,10 @@ def excitation(cycles: int, length: int) -> NDArray[np.int64]:
 
 
 def measured_delay(position: Array, torque: Array, period: float, mechanics: Mechanics) -> float:
-    """D in periods from positions [rad] at each SYNC and the torques [N·m] commanded after it.
+    """Return D in periods from positions [rad] at each SYNC and torques [N·m] commanded after it.
 
-    Both of shape (n,); a position that is missing is NaN. The fit starts from `mechanics`, at rest
-    in the first position. Raises ValueError where the torques do not explain the motion.
+    Both have shape (n,); a missing position is NaN. The fit starts from `mechanics`, at rest in the
+    first position. Raises ValueError where the torques do not explain the motion.
     """
     known = np.isfinite(position)
     j = np.arange(len(position))
@@ -113,7 +113,7 @@ def measured_delay(position: Array, torque: Array, period: float, mechanics: Mec
 
 
 def _fast(signal: Array) -> Array:
-    """A signal less its moving average."""
+    """Return a signal less its moving average."""
     return np.asarray(signal - uniform_filter1d(signal, _AVERAGED, mode="nearest"))
 
 
@@ -122,7 +122,7 @@ def _rms(signal: Array) -> float:
 
 
 def _scales(period: float, mechanics: Mechanics, torque: float) -> Array:
-    """Units of mass, viscous friction, spring, Coulomb friction, bias and delay in the fit."""
+    """Return the units of mass, viscous friction, spring, Coulomb friction, bias and delay."""
     mass = mechanics.inertia_kg_m2
     viscous = max(mechanics.viscous_nm_s_per_rad, 1e-3 * mass / period)
     spring = 0.01 * mass / period**2
@@ -143,7 +143,7 @@ def _motion(parameters: Array, start: float, torque: Array, period: float) -> Ar
 def _follow(
     plants: NDArray[np.void], start: float, held: Array, late: float, period: float, position: Array
 ) -> None:
-    """Positions at each SYNC under forces that change `late` after it."""
+    """Compute positions at each SYNC under forces that change `late` after it."""
     plant: Record = plants[0]
     y, v = start, 0.0
     for j in range(len(position)):

@@ -144,7 +144,7 @@ class Exchange:
 
     @property
     def name(self) -> str:
-        """How a summary calls it."""
+        """Name of the transport in a summary."""
         return self.transport.name
 
     @property
@@ -251,7 +251,7 @@ class Exchange:
 
 
 def _check_late(axis: WallAxis) -> None:
-    """Give the wall up whose RPDOs have come too late for too many cycles."""
+    """Give up a wall whose RPDOs have been late for too many cycles."""
     most = axis.limits.late_cycles
     if most and axis.late_in_a_row >= most:
         axis.give_up(

@@ -37,7 +37,7 @@ from canwall.record import Phase
 _ENABLE_CYCLES = 2000
 #: How long a drive may take to leave it by RPDO, before SDO takes its voltage [s, cycles].
 _LEAVE_S, _LEAVE_CYCLES = 0.1, 20
-#: Cycles without a TPDO after which a drive is taken for gone while enabling and leaving.
+#: Cycles without a TPDO after which a drive counts as silent while enabling and leaving.
 _SILENT_CYCLES = 50
 #: SYNCs in which a drive that does not follow its RPDOs may still hear of its end from them.
 _LAST_RPDOS = 5
@@ -50,7 +50,7 @@ _FIRST_CYCLES, _FIRST_S = 10, 0.2
 
 @dataclass
 class Outcome:
-    """How the loop ended."""
+    """End of a run."""
 
     cycles: int = 0
     interrupted: bool = False
@@ -59,11 +59,11 @@ class Outcome:
     """The cycle at which a limit was passed, or a report ended the wall."""
     disabled: bool = False
     notes: list[str] = field(default_factory=list)
-    """What the drives would not do on the way out though they are disabled."""
+    """Steps of the way out that the drives refused though they are disabled."""
 
 
 class WallGivenUpError(RunFailedError):
-    """The wall is given up; the text says why."""
+    """A wall that was given up; the text gives the reason."""
 
 
 def run_loop(
@@ -74,7 +74,7 @@ def run_loop(
 ) -> Outcome:
     """Enable the drives, render the walls for `cycles` SYNCs (None: until stopped), disable them.
 
-    stop is asked once a cycle; progress is told the cycle about every 100 ms of bus time.
+    stop is polled once a cycle; progress gets the cycle about every 100 ms of bus time.
     """
     outcome = Outcome()
     loop = Loop(exchange, stop, progress)
@@ -104,7 +104,7 @@ def run_loop(
 
 
 def _leave(loop: "Loop", outcome: Outcome) -> None:
-    """By the cycle; where that failed, or a trip gave cause for doubt, by SDO; at last by NMT."""
+    """Disable by the cycle; by SDO where that failed or a trip leaves doubt; by NMT at last."""
     try:
         outcome.disabled = loop.leave()
         if outcome.disabled and not outcome.trips:
@@ -155,7 +155,10 @@ class Loop:
         return text if len(self._axes) == 1 else f"{axis.name}: {text}"
 
     def enable(self) -> None:
-        """Zero torque and the state machines up."""
+        """Take the state machines up to OPERATION ENABLED with zero torque.
+
+        Raises WallGivenUpError where a drive does not follow.
+        """
         self._enter(Phase.ENABLING)
         self._first_positions()
         ways = [Enabling() for _ in self._axes]
@@ -195,7 +198,10 @@ class Loop:
             start_at(axis.cycle, int(axis.cycle["counts"][0]))
 
     def render(self, cycles: int | None) -> bool:
-        """The walls until time is up; whether it was stopped before."""
+        """Render the walls until time is up; return whether it was stopped before.
+
+        Raises WallGivenUpError at a trip.
+        """
         if self._stop() or self._measure_delays():
             return True
         for axis in self._axes:
@@ -215,7 +221,7 @@ class Loop:
         return False
 
     def _most(self, cycles: int | None, pending: list[tuple[WallAxis, list[WallStage]]]) -> int:
-        """Cycles until there is something to be done: the end, progress to be told, a change."""
+        """Return the cycles until the end, the next report of progress, or the next change."""
         ends = [self.j + self._exchange.ahead]
         ends.append((self.j // self._progress_every + 1) * self._progress_every)
         if cycles is not None:
@@ -228,7 +234,7 @@ class Loop:
         return max(1, min(ends) - self.j)
 
     def _measure_delays(self) -> bool:
-        """Find the delay of the axes that ask for it; whether it was stopped before."""
+        """Measure the delay of the axes that ask for it; return whether it was stopped before."""
         tests = [DelayTest(axis) for axis in self._axes if axis.measures_delay]
         if not tests:
             return False
@@ -257,7 +263,7 @@ class Loop:
                 raise WallGivenUpError(self._say(axis, trip_text(axis, self._exchange)))
 
     def leave(self) -> bool:
-        """Zero torque and the state machines down; whether the drives confirmed it."""
+        """Take the state machines down with zero torque; return whether the drives confirmed it."""
         self._enter(Phase.LEAVING)
         if any(axis.cycle["trip"][0] == Trip.MISSED_TPDO for axis in self._axes):
             # The drive may hear though it is not heard: quick stop, whatever its state.
@@ -278,7 +284,7 @@ class Loop:
         return False
 
     def disable_over_sdo(self) -> None:
-        """No voltage and zero torque without the cycle. Raises DriveError, once all were asked."""
+        """Disable the drives over SDO. Raises DriveError, after all were asked."""
         failed: DriveError | None = None
         for axis in self._axes:
             try:
@@ -290,7 +296,7 @@ class Loop:
             raise failed
 
     def disarm(self) -> list[str]:
-        """The watchdogs off; what drives say that would not have it, and will miss their master."""
+        """Switch the watchdogs off; return a line for each drive that refuses."""
         refused = []
         for axis in self._axes:
             try:
@@ -301,7 +307,7 @@ class Loop:
         return refused
 
     def reset(self) -> bool:
-        """The last resort: a drive that boots gives no torque. Whether the frames went out."""
+        """Send NMT RESET NODE, after which a drive gives no torque; return whether it was sent."""
         try:
             for axis in self._axes:
                 axis.node.command("RESET")
@@ -339,14 +345,14 @@ def _change(axis: WallAxis, changes: list[WallStage], period: float) -> None:
 
 
 def _advance_enabling(axis: WallAxis, way: Enabling) -> bool:
-    """Whether the drive shows OPERATION ENABLED; sets the controlword that leads there."""
+    """Set the controlword that leads to OPERATION ENABLED; return whether the drive shows it."""
     statusword = int(axis.cycle["statusword"][0])
     axis.cycle["controlword"] = way.next(statusword)
     return state_of(statusword) is DriveState.OPERATION_ENABLED
 
 
 def _is_down(axis: WallAxis) -> bool:
-    """Whether the drive has shown, since it is being left, that it gives no torque."""
+    """Return whether the drive has shown, since it is being left, that it gives no torque."""
     state = state_of(int(axis.cycle["statusword"][0]))
     return state in _DISABLED and bool(axis.row["phase"][0] == Phase.LEAVING)
 

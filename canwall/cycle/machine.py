@@ -1,7 +1,7 @@
-"""What the machine does for a cycle that keeps to the clock, where the process may have it.
+"""Set-up of the machine for a cycle that keeps to the clock, as far as the process may.
 
-Besides the priority of the loop's thread (`realtime`): memory that stays in RAM, processors that
-do not fall asleep deeply, a processor to stay on, and other Python threads that let go soon.
+Besides the priority of the loop's thread (`realtime`): locked memory, no deep idle states,
+processor affinity, and a short switch interval for other Python threads.
 """
 
 import ctypes
@@ -28,10 +28,10 @@ _SWITCH_INTERVAL_S = 1e-4
 
 @contextmanager
 def real_time_machine(processor: int | None = None) -> Iterator[dict[str, Grant]]:
-    """Everything that the process may have; tells what was granted, and how to get the rest.
+    """Take everything that the process may have; yield what was granted, and how to get the rest.
 
-    `processor`: the one that the loop's thread is to stay on; it may be one that is kept free of
-    others (isolcpus). All is put back at the end.
+    processor: the one that the loop's thread stays on, perhaps one that isolcpus keeps free.
+    Everything is put back at the end.
     """
     interval = sys.getswitchinterval()
     sys.setswitchinterval(min(interval, _SWITCH_INTERVAL_S))

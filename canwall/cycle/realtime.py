@@ -13,14 +13,14 @@ _PRIORITY = 45
 
 
 class Grant(NamedTuple):
-    """What the machine does for the loop, in words, and what would make it do more, or ""."""
+    """One thing granted, in words, and how to get more (empty: nothing is missing)."""
 
     found: str
     advice: str = ""
 
 
 def limits_line(item: str, value: object) -> str:
-    """What allows it to this user from the next login on: a line for limits.conf."""
+    """Return the line of limits.conf that allows it to this user from the next login on."""
     try:
         user = getpass.getuser()
     except (KeyError, OSError):  # a user without a name
@@ -30,11 +30,10 @@ def limits_line(item: str, value: object) -> str:
 
 @contextmanager
 def real_time_priority() -> Iterator[Grant]:
-    """Run the calling thread under SCHED_FIFO; tells what was granted.
+    """Run the calling thread under SCHED_FIFO; yield what was granted.
 
-    Threads and processes that it starts meanwhile do not inherit it. Where less than the full
-    priority is allowed (RLIMIT_RTPRIO), that is taken. Without the permission the loop runs as any
-    program does, and its SYNCs come when the scheduler lets it.
+    Threads and processes that it starts do not inherit the priority. Where RLIMIT_RTPRIO allows
+    less than the full priority, that is taken; without permission the scheduling stays as it is.
     """
     before, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
     granted = _raise_priority()
@@ -54,7 +53,7 @@ def real_time_priority() -> Iterator[Grant]:
 
 
 def _raise_priority() -> int:
-    """Take the highest priority that is allowed, and tell it; 0: none is."""
+    """Take the highest priority that is allowed and return it; 0: none is."""
     soft, hard = resource.getrlimit(resource.RLIMIT_RTPRIO)
     if soft != hard:
         resource.setrlimit(resource.RLIMIT_RTPRIO, (hard, hard))

@@ -86,7 +86,7 @@ class SocketTransport:
 
     @property
     def poll_ns(self) -> int:
-        """How long frames are polled for before the wait is a sleep [ns]."""
+        """Time for which frames are polled for before the wait is a sleep [ns]."""
         return int(self._socket["poll_ns"][0])
 
     @poll_ns.setter
@@ -132,7 +132,7 @@ class SocketTransport:
 
 @intrinsic  # type: ignore[untyped-decorator]
 def _call_idle(typingctx: Any, address: Any, state: Any) -> Any:
-    """Whether the compiled idle function at `address` did all that there was to be done."""
+    """Call the compiled idle function at `address`; 0 where Python's has to be called."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         number = ir.IntType(64)

@@ -29,7 +29,7 @@ _NAN = int(Trip.NOT_A_NUMBER)
 _RENDERING = int(Phase.RENDERING)
 _MEASURING = int(Phase.MEASURING)
 
-#: After more cycles than this without a sample the estimate is taken up anew.
+#: After more cycles than this without a sample the estimator starts again.
 _BLIND_CYCLES = 5
 
 
@@ -51,7 +51,7 @@ def _placed(value: int, field: Record) -> int:
 
 @compiled
 def read_inputs(cycles: NDArray[np.void], data: int) -> None:
-    """Take position, statusword and torque out of a TPDO's data (little-endian number)."""
+    """Read position, statusword and torque from a TPDO's data (little-endian number)."""
     cycle: Record = cycles[0]
     cycle.counts = _signed(data, cycle.in_position[0])
     cycle.statusword = _unsigned(data, cycle.in_statusword[0])
@@ -63,10 +63,10 @@ def read_inputs(cycles: NDArray[np.void], data: int) -> None:
 
 @compiled
 def _set_wall_inputs(cycle: Record, rendered: Record, due: bool) -> None:
-    """Show a wall what there is to be seen of the handle, relative to itself.
+    """Set position, velocity and bias force relative to the wall.
 
-    The estimator works on the drive's axis, turned towards the wall: it does not notice when the
-    wall is moved. `due` says that a new sample is there and the law will be asked.
+    The estimator works on the drive's axis, oriented towards the wall, and is not disturbed when
+    the wall is moved. due: the law will be evaluated on a new sample.
     """
     wall, estimator = rendered.wall[0], cycle.estimator[0]
     origin = cycle.orientation * rendered.position
@@ -85,7 +85,7 @@ def _set_wall_inputs(cycle: Record, rendered: Record, due: bool) -> None:
 
 @compiled
 def _advance_divider(rendered: Record, received: bool) -> bool:
-    """Whether the law is asked in this cycle: every so many, and not without a sample."""
+    """Count the cycle; return whether the law is evaluated: every n-th, with a sample."""
     rendered.waited += 1
     if not received or rendered.waited < rendered.divider:
         return False
@@ -95,7 +95,7 @@ def _advance_divider(rendered: Record, received: bool) -> bool:
 
 @compiled
 def _force_of(cycle: Record, rendered: Record, due: bool) -> float:
-    """Force of a wall: what its law says now, or said when it was last asked."""
+    """Return the force of a wall: of its law now, or when that was last evaluated."""
     if rendered.law < 0:
         return 0.0
     if due:
@@ -105,7 +105,7 @@ def _force_of(cycle: Record, rendered: Record, due: bool) -> float:
 
 @compiled
 def _faded_force(cycle: Record, force: float, received: bool) -> float:
-    """The wall's force on its way from the wall before."""
+    """Blend the force of the previous wall into that of the present one."""
     faded = cycle.faded[0]
     due = _advance_divider(faded, received)
     _set_wall_inputs(cycle, faded, due)
@@ -119,7 +119,7 @@ def _faded_force(cycle: Record, force: float, received: bool) -> float:
 
 @compiled
 def _held_force(cycle: Record) -> float:
-    """Without a TPDO: hold the torque, then let go of it along a ramp, then give up."""
+    """Return the force without a TPDO: the last one, then a ramp to zero, then a trip."""
     held = cycle.orientation * cycle.torque_per_mille * cycle.nm_per_mille
     overdue = cycle.missed_in_a_row - cycle.hold_cycles
     if overdue <= 0:
@@ -132,7 +132,7 @@ def _held_force(cycle: Record) -> float:
 
 @compiled
 def _wanted_force(cycle: Record, received: bool, due: bool) -> float:
-    """Force out of the wall from the instant of actuation on; sets the trip that ends it."""
+    """Return the force out of the wall from the instant of actuation on; set a trip if any."""
     if received:
         check_limits(cycle)
     elif not cycle.trip:
@@ -155,7 +155,7 @@ def _wanted_force(cycle: Record, received: bool, due: bool) -> float:
 
 @compiled
 def _account_contact(cycle: Record, received: bool) -> None:
-    """Energy that the wall has put out in this contact, and the strikes that are over.
+    """Account for the energy put out in this contact, and count the strikes that are over.
 
     W = Σ f_applied[j]·(y[j+1] − y[j]) (theory, section 5), from the beginning of a contact on.
     """

@@ -28,7 +28,7 @@ class Transport(Protocol):
     """Moves the frames of one core."""
 
     name: str
-    """How a summary calls it."""
+    """Name in a summary."""
 
     def run(self) -> Want:
         """Do what the core wants until that is something of Python's (from `Want.DONE` on).

@@ -1,4 +1,4 @@
-"""What ended a wall, in words: what, when, by how much, and where to look."""
+"""Text of a trip: what happened, when, by how much, and where to look."""
 
 from canwall.cycle.axis import WallAxis
 from canwall.cycle.exchange import Exchange
@@ -7,12 +7,12 @@ from canwall.drive import status_text
 
 
 def shown_state(axis: WallAxis) -> str:
-    """The state that the drive's latest statusword shows."""
+    """Return the state in the drive's latest statusword."""
     return status_text(int(axis.cycle["statusword"][0]))
 
 
 def latest_emergency(axis: WallAxis) -> str:
-    """The drive's latest EMCY, to be put behind what came of it; empty if there was none."""
+    """Return the drive's latest EMCY as a suffix of a message; empty if there was none."""
     if not axis.node.emergencies:
         return ""
     latest = axis.node.emergencies[-1]
@@ -20,7 +20,7 @@ def latest_emergency(axis: WallAxis) -> str:
 
 
 def trip_text(axis: WallAxis, exchange: Exchange) -> str:
-    """The trip that is set: its cycle, its value, and the key that it has passed."""
+    """Describe the trip that is set: cycle, value, and the key of the limit."""
     cycle, row = axis.cycle[0], axis.row[0]
     j = int(row["j"])
     trip = Trip(int(cycle["trip"]))
@@ -79,7 +79,7 @@ def _too_short(axis: WallAxis) -> str:
 
 
 def _pause(axis: WallAxis, exchange: Exchange) -> str:
-    """Why a drive has left where it was its master that was not there."""
+    """Explain a drive that has left because its master had stood still."""
     watchdog, pause_s = axis.setup.watchdog, exchange.longest_pause_s()
     # The latest sign of life may have been a period old when the pause began.
     before_s = watchdog.period_s if watchdog.error_control else 0.0

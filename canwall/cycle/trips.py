@@ -1,4 +1,4 @@
-"""Why a wall is given up: the limits that are looked after within the step."""
+"""Trips: the limits that the step checks in every cycle."""
 
 from enum import IntEnum
 
@@ -9,7 +9,7 @@ from canwall.walls import start_open_loop
 
 
 class Trip(IntEnum):
-    """Why the wall was given up."""
+    """Reason for which the wall was given up."""
 
     NONE = 0
     SPEED = 1
@@ -19,7 +19,7 @@ class Trip(IntEnum):
     NOT_A_NUMBER = 5
     ENERGY = 6
     REPORTED = 7
-    """Something that came over the bus beside the cycle: EMCY, heartbeat, error frame."""
+    """A frame beside the cycle: EMCY, heartbeat, error frame."""
     JUMP = 8
     """A position far from where the handle can have gone since the one before."""
     STUCK = 9
@@ -51,7 +51,7 @@ _UNMODELLED = 100.0
 
 @compiled
 def check_limits(cycle: Record) -> None:
-    """Set the trip of a limit that is passed; one that is set stays."""
+    """Set the trip of a limit that is exceeded; one that is set stays."""
     if cycle.trip:
         return
     position = cycle.counts * cycle.rad_per_count
@@ -71,15 +71,14 @@ def check_limits(cycle: Record) -> None:
 
 @compiled
 def _is_stuck(cycle: Record) -> bool:
-    """Whether a handle that does not move any more was going on a moment ago.
+    """Return whether the encoder has stopped although the handle goes on moving.
 
-    Two witnesses have to agree, in direction as well: the model, which knows the torques, but may
-    have the wrong mass, and is not shown the position that stays, for it soon believes it; and the
-    last two changes of the position, carried on: a handle that was stopped slowed down, unless
-    _UNMODELLED could do that within a cycle.
-    Three positions that are rounded to counts leave 3 counts open of the change to which they
-    carry on, 2·(y[j] − y[j−1]) − (y[j−1] − y[j−2]); the least of it counts. What is slower than
-    _LEAST_COUNTS may have come to a stop within a count, unseen.
+    Two predictions have to agree, in direction as well: the open-loop model, which knows the
+    torques but may have the wrong mass; and the extrapolation of the last two changes of the
+    position, since a handle that is stopped slows down, unless _UNMODELLED stops it within a cycle.
+    Three positions rounded to counts leave the extrapolated change,
+    2·(y[j] − y[j−1]) − (y[j−1] − y[j−2]), uncertain by 3 counts: its lower bound is used. A handle
+    slower than _LEAST_COUNTS may have come to a stop within a count, which is not observable.
     """
     last, before = abs(cycle.change), abs(cycle.change_before)
     least = min(last - 1.0, 2.0 * last - before - 3.0)
@@ -92,10 +91,10 @@ def _is_stuck(cycle: Record) -> bool:
 
 @compiled
 def compare_position(cycle: Record, change: int, missed: int) -> None:
-    """How far the position is from the one expected; a jump is a trip before it is made use of.
+    """Compare the position with the one predicted; a jump trips before the estimator uses it.
 
-    The estimator expects it where the torques on their way and the force estimated take the
-    handle, after `missed` cycles without a sample as well. `change`: of the position [counts].
+    The prediction follows the torques in flight and the estimated force, through `missed` cycles
+    without a sample as well. change: of the position since the last sample [counts].
     """
     cycle.innovation = cycle.oriented - cycle.estimator[0].y
     if missed or not cycle.started:
@@ -125,10 +124,10 @@ def compare_position(cycle: Record, change: int, missed: int) -> None:
 
 @compiled
 def compare_torque(cycle: Record) -> None:
-    """Count the cycles in which 0x6077 is beyond everything that was commanded of late.
+    """Count the cycles in which 0x6077 is outside the range of the recent commands.
 
-    What is remembered of the commands fades within torque_error_cycles, so a current loop that
-    lags, or a torque actual value that is filtered, stays between its bounds.
+    The range decays within torque_error_cycles, so that a current loop with a lag, or a filtered
+    torque actual value, stays inside it.
     """
     sent = float(cycle.torque_per_mille)
     fading = 2.0 / cycle.torque_error_cycles
