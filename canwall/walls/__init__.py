@@ -18,8 +18,11 @@ from canwall.walls.estimator import (
     start_open_loop,
 )
 from canwall.walls.interface import (
+    DEADBEAT,
     HORIZON,
     WALL,
+    Law,
+    UnknownLawError,
     call_law,
     clear_memory,
     law,
@@ -27,7 +30,7 @@ from canwall.walls.interface import (
     set_referent,
 )
 from canwall.walls.layers import TENSION, set_applied_force, wall_force
-from canwall.walls.registry import DEADBEAT, LAWS, Law, UnknownLawError, find_law
+from canwall.walls.registry import LAWS, find_law
 
 __all__ = [
     "DEADBEAT",

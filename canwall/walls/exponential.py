@@ -21,6 +21,6 @@ def exponential(wall: Record) -> float:
     """F = K·L·(exp(−y[j]/L) − 1) while the sample is inside."""
     if wall.y_sample >= 0.0:
         return 0.0
-    length = wall.options[0]
+    length = wall.options.length
     depth = min(-wall.y_sample / length, _LARGEST_EXPONENT)
     return wall.stiffness * length * math.expm1(depth)

@@ -19,6 +19,6 @@ def hysteresis(wall: Record) -> float:
         return 0.0
     if wall.v_sample <= 0.0:
         return -wall.stiffness * wall.y_sample
-    if wall.y_sample > -wall.options[1]:
+    if wall.y_sample > -wall.options.release:
         return 0.0
-    return -wall.options[0] * wall.stiffness * wall.y_sample
+    return -wall.options.softening * wall.stiffness * wall.y_sample

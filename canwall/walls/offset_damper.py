@@ -16,6 +16,6 @@ OPTIONS = {"offset": -0.002}
 def offset_damper(wall: Record) -> float:
     """F = −K·y[j] inside, −B·ẏ[j] below the offset."""
     force = spring(wall)
-    if wall.y_sample < wall.options[0]:
+    if wall.y_sample < wall.options.offset:
         force -= wall.damping * wall.v_sample
     return force

@@ -24,7 +24,7 @@ def _velocity_after_impact(wall: Record) -> float:
         wall.viscous,
         wall.spring,
         0.0,
-        -wall.options[0] * v_impact,
+        -wall.options.restitution * v_impact,
         wall.d,
         0.0,
         period - impact,
@@ -42,6 +42,6 @@ def rigid(wall: Record) -> float:
             return 0.0
         v_wanted = _velocity_after_impact(wall)
     else:
-        v_out = -wall.options[0] * wall.v if wall.v < 0.0 else v_free
-        v_wanted = max(v_out, -wall.options[1] * wall.y / wall.period)
+        v_out = -wall.options.restitution * wall.v if wall.v < 0.0 else v_free
+        v_wanted = max(v_out, -wall.options.recovery * wall.y / wall.period)
     return max((v_wanted - v_free) / wall.gamma[1], 0.0)

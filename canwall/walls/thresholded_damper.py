@@ -16,6 +16,6 @@ def thresholded_damper(wall: Record) -> float:
     """F = −K·y[j] − B·(ẏ[j] beyond ±threshold) while the sample is inside."""
     if wall.y_sample >= 0.0:
         return 0.0
-    threshold = wall.options[0]
+    threshold = wall.options.threshold
     beyond = wall.v_sample - min(max(wall.v_sample, -threshold), threshold)
     return -wall.stiffness * wall.y_sample - wall.damping * beyond
