@@ -95,9 +95,9 @@ class UnknownLawError(InputError):
 class Law:
     """A function of one WALL record that returns a force, and the options that it reads.
 
-    The function is compiled when it is first called for. Compiled code calls it by `address`,
-    which stands in a record, so laws can be exchanged between two cycles without touching the
-    code that calls them.
+    Compiled code calls it by `address`, which stands in a record, so laws can be exchanged between
+    two cycles without touching the code that calls them. The function is compiled at its first
+    use: most runs use one or two laws.
 
     Attributes:
         name: Name in configurations and summaries.
@@ -123,18 +123,22 @@ class Law:
         self._compiled: Any = None
         self._compiling = threading.Lock()
 
-    @property
-    def address(self) -> int:
-        """Address of the compiled function in this process; the first use compiles or loads it.
+    def compile(self) -> None:
+        """Compile the function, or load it from disk, unless that is done; any thread may call.
 
         Raises numba's NumbaError where the function is not within what numba compiles.
         """
         with self._compiling:
             if self._compiled is None:
                 signature = types.float64(from_dtype(wall_with(self.options)))
-                compile_ = cfunc(signature, cache=self._cached, error_model="numpy")
-                self._compiled = compile_(self._function)
-            return int(self._compiled.address)
+                compiling = cfunc(signature, cache=self._cached, error_model="numpy")
+                self._compiled = compiling(self._function)
+
+    @property
+    def address(self) -> int:
+        """Address of the compiled function in this process; compiles at its first use."""
+        self.compile()
+        return int(self._compiled.address)
 
     def option_values(self, given: Mapping[str, float]) -> list[float]:
         """All options in the order of the record, defaults where none is `given`.

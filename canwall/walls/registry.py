@@ -104,8 +104,7 @@ def _load(path: Path, function: str) -> Law:
     options = _declared_options(where, getattr(module, "OPTIONS", {}))
     law = Law(where, _guarded(written), options, cached=False)
     try:
-        # Compiled now: what is wrong with it is said before the drive is enabled.
-        _ = law.address
+        law.compile()
     except NumbaError as error:
         raise UnknownLawError(f"{where}: does not compile: {_gist(error)}") from None
     except KeyError as error:  # numba's, for a field that a record does not have
