@@ -1,6 +1,6 @@
 """The laws of the virtual wall: a file per law, the estimator, the layers, the registry.
 
-A law is one function from the record of one wall (`WALL`) to the force that pushes the operator
+A law is a function of the record of one wall (`WALL`) that returns the force pushing the operator
 out of it. Nothing here knows of CAN, counts or drives.
 """
 

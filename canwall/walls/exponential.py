@@ -12,7 +12,7 @@ from canwall.walls.interface import law
 #: length: depth over which the stiffness grows by a factor e.
 OPTIONS = {"length": 0.02}
 
-# Beyond it exp() would overflow; no drive reaches the forces that go with it.
+# exp() overflows far beyond it; no drive reaches these forces.
 _LARGEST_EXPONENT = 50.0
 
 

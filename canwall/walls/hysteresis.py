@@ -1,7 +1,7 @@
 """A spring with hysteresis: it releases earlier, or softer, than it engages.
 
-Lost energy on the way out pays for what sampling adds. Both kinds in one: the wall engages at
-the surface and releases at `release` inside it, and while the handle leaves, its stiffness is
+The energy dissipated makes up for what sampling adds. Two kinds in one: the wall engages at the
+surface and releases at the depth `release`, and while the handle moves out, the stiffness is
 `softening` times K.
 """
 

@@ -31,20 +31,20 @@ WALL = np.dtype(
         # The wall to be rendered.
         ("stiffness", "f8"),
         ("damping", "f8"),
-        # The model of what moves: m·ÿ + b·ẏ + k_h·y = f + d, held over one period T.
+        # The plant: m·ÿ + b·ẏ + k_h·y = f + d, with its equivalent for forces held over T.
         ("mass", "f8"),
         ("viscous", "f8"),
         ("spring", "f8"),
         ("period", "f8"),
         ("phi", "f8", (2, 2)),
         ("gamma", "f8", (2,)),
-        # The same with the continuous wall: the referent that the rendered wall is to match.
+        # The plant on the continuous wall: the referent that the rendered wall is to match.
         ("referent", PLANT, (1,)),
-        # Position as sampled and its velocity: what a law without a model has.
+        # Position as sampled and its velocity, for laws without a model.
         ("y_sample", "f8"),
         ("v_sample", "f8"),
-        # State at the instant at which the force takes effect, and the bias force: what a
-        # model-based law works on.
+        # State at the instant at which the force takes effect, and the bias force, for laws with
+        # a model.
         ("y", "f8"),
         ("v", "f8"),
         ("d", "f8"),
@@ -168,7 +168,7 @@ def law(function: Callable[[Any], float]) -> Law:
 
 @intrinsic
 def call_law(typingctx: Any, address: Any, wall: Any) -> Any:
-    """Force of the law at `address` for one record of dtype WALL; from compiled code only."""
+    """Return the force of the law at `address` for one WALL record; for compiled code only."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         record = context.get_value_type(wall)
@@ -181,7 +181,10 @@ def call_law(typingctx: Any, address: Any, wall: Any) -> Any:
 def set_plant(
     wall: NDArray[np.void], mass: float, viscous: float, spring: float, period: float
 ) -> None:
-    """Write the model of what moves and its ZOH equivalent into a WALL array of shape (1,)."""
+    """Write the plant and its zero-order-hold equivalent into a WALL array of shape (1,).
+
+    Mass, viscous damping and spring in SI units, linear or angular; period in s.
+    """
     for name, value in (("mass", mass), ("viscous", viscous), ("spring", spring)):
         wall[name] = value
         wall["referent"][name] = value
@@ -212,7 +215,7 @@ def clear_memory(wall: NDArray[np.void]) -> None:
 
 @compiled
 def free_step(wall: Record, y: float, v: float, force: float) -> tuple[float, float]:
-    """State one period later under a held force: Φ·x + Γ·(f + d)."""
+    """Return the state one period later under a held force: Φ·x + Γ·(f + d)."""
     phi, gamma = wall.phi, wall.gamma
     u = force + wall.d
     return (

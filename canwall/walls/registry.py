@@ -36,7 +36,7 @@ from canwall.walls import (
 )
 from canwall.walls.interface import DEADBEAT, MAX_OPTIONS, WALL, Law, UnknownLawError
 
-#: Every law that comes with the project, in the order of theory.md.
+#: Every law that comes with the project, by name.
 LAWS: dict[str, Law] = {
     found.name: found
     for module in (

@@ -1,7 +1,7 @@
-"""A damped wall whose damper is deaf to slow motion.
+"""A damped wall whose damper ignores slow motion.
 
 One of Rosenberg's variants (section 5.2.2). Below the threshold the velocity of a quantised
-position is mostly noise; leaving it out lets the damping be higher.
+position is mostly noise; without it the damping can be higher.
 """
 
 from canwall.compiled import Record

@@ -1,4 +1,4 @@
-"""Laws by name, their options, and what they may not do: allocate."""
+"""Laws by name, their options, when they are compiled, and that they do not allocate."""
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -112,7 +112,7 @@ def _counted_allocations() -> Iterator[None]:
 
 
 def allocations(law: Law) -> int:
-    """What numba's runtime allocates while a ball bounces on a law."""
+    """Number of allocations by numba's runtime while a ball bounces on a law."""
     ball = Ball(9.0, damping=0.1, viscous=0.01, spring=0.1, tension="budget", passivity=0.5)
     wall = wall_of(ball, "standard")
     wall["option_values"][0, : len(law.options)] = law.option_values({})
@@ -128,12 +128,12 @@ def allocations(law: Law) -> int:
 @pytest.mark.usefixtures("_counted_allocations")
 @pytest.mark.parametrize("law", LAWS)
 def test_no_law_allocates_in_the_cycle(law: str) -> None:
-    # An array that enters compiled code costs one reference, however long that runs.
+    # An array that enters compiled code costs one reference per call.
     assert allocations(LAWS[law]) <= 4
 
 
 @pytest.mark.usefixtures("_counted_allocations")
-def test_a_law_that_allocates_would_be_seen(tmp_path: Path) -> None:
+def test_a_law_that_allocates_is_detected(tmp_path: Path) -> None:
     (tmp_path / "wasteful.py").write_text(
         "import numpy as np\n"
         "def wasteful(wall):\n"

@@ -1,4 +1,4 @@
-"""A law in the user's own file: the documentation's example, and what can be wrong with one."""
+"""A law in the user's own file: the documentation's example, and errors in such files."""
 
 import runpy
 import shutil
@@ -111,7 +111,7 @@ def test_options_of_an_own_law(example: str) -> None:
 
 
 def test_options_are_read_by_name_and_there_may_be_many(write: Write) -> None:
-    """Sixty-four options, each of which the force shows apart from the others."""
+    """Each of 64 options has an effect of its own on the force."""
     names = [f"weight_{i}" for i in range(64)]
     terms = " + ".join(f"wall.options.{name} * wall.y**{i}" for i, name in enumerate(names))
     law = write(f"OPTIONS = dict.fromkeys({names}, 0)\ndef mine(wall):\n    return {terms}\n")
@@ -123,7 +123,7 @@ def test_options_are_read_by_name_and_there_may_be_many(write: Write) -> None:
         assert wall_force(found.address, wall[0]) == pytest.approx(2.0 * (-1.5) ** i)
 
 
-def test_options_of_one_law_are_gone_for_the_next() -> None:
+def test_options_of_one_law_do_not_reach_the_next() -> None:
     wall = np.zeros(1, WALL)
     set_referent(wall, 1.0, 0.0, LAWS["hysteresis"].option_values({"release": 0.1}))
     assert list(wall["option_values"][0, :3]) == [0.8, 0.1, 0.0]
@@ -234,7 +234,7 @@ def test_run_says_it_in_one_line(write: Write, tmp_path: Path) -> None:
         "return 1 // int(wall.y)",
     ],
 )
-def test_exception_in_a_law_is_a_force_that_is_no_number(tmp_path: Path, body: str) -> None:
+def test_exception_in_a_law_is_a_nan_force(tmp_path: Path, body: str) -> None:
     file = tmp_path / "raises.py"
     file.write_text(f"def raises(wall):\n    if wall.y < 0.0:\n        {body}\n    return 0.25\n")
     found = find_law(f"{file}:raises")
