@@ -12,8 +12,8 @@ compiled by numba: arithmetic, `math`, `if` and loops over numbers.
 
 from typing import Any
 
-#: What `[wall.options]` may set, in this order in `wall.options`; here: growth [1/rad or 1/m], the
-#: stiffness doubles within a depth of 1/growth.
+#: Names and defaults of what `[wall.options]` may set; the function reads `wall.options.growth`.
+#: growth [1/rad or 1/m]: the stiffness doubles within a depth of 1/growth.
 OPTIONS = {"growth": 5.0}
 
 
@@ -21,6 +21,6 @@ def my_law(wall: Any) -> float:
     """F = K·depth·(1 + growth·depth) − B·ẏ, with the depth in the middle of the coming period."""
     if wall.y >= 0.0:
         return 0.0
-    growth = wall.options[0]
+    growth = wall.options.growth
     depth = max(0.0, -(wall.y + 0.5 * wall.period * wall.v))
     return wall.stiffness * depth * (1.0 + growth * depth) - wall.damping * wall.v

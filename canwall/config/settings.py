@@ -1,4 +1,4 @@
-"""The sections of a configuration, and what they say together."""
+"""The sections of a configuration, and the checks that span several of them."""
 
 from typing import Annotated, Literal, NamedTuple, Self
 
@@ -6,13 +6,21 @@ import tomli_w
 from pydantic import Field, field_validator, model_validator
 
 from canwall.config.drive import Drive
-from canwall.config.section import Names, NonNegative, Number, Positive, Section
+from canwall.config.section import (
+    Change,
+    Names,
+    NonNegative,
+    Number,
+    Positive,
+    Section,
+    changing,
+)
 from canwall.config.simulation import Simulation
 from canwall.config.sweep import AxisValues
 
 
 class Bus(Section):
-    """`[bus]`: where the drive is, and how long one period of the SYNC is."""
+    """`[bus]`: the interface to the drive, the period of the SYNC and who sends it."""
 
     interface: str = "virtual"
     channel: str = "canwall"
@@ -36,7 +44,7 @@ class Mechanics(Section):
 
 
 class Wall(Section):
-    """`[wall]`: where it is, how stiff, and by which law it is rendered."""
+    """`[wall]`: position, stiffness and damping, and the law that renders it."""
 
     law: str = "half_sample"
     position_rad: Number = 0.0
@@ -53,12 +61,15 @@ class Wall(Section):
 
 
 class Estimator(Section):
-    """`[estimator]`: the Kalman filter: how fast the operator's force may change, and the delay.
+    """`[estimator]`: the Kalman filter.
 
-    delay_cycles is D, from the sampling of a position to the torque computed from it taking
-    effect, in cycles. Where it is not given it is 1 with synchronous PDOs; with others, or with
-    measure_delay, it is measured before the wall is rendered, by small torques of
-    measure_torque_nm for measure_cycles.
+    Attributes:
+        force_walk_nm_per_sqrt_s: Random walk of the operator's force.
+        delay_cycles: Delay D from the sampling of a position until the torque computed from it
+            takes effect, in cycles. Default: 1 with synchronous PDOs; measured with others.
+        measure_delay: Measure the delay in any case, before the wall is rendered.
+        measure_torque_nm: Amplitude of the small torques by which it is measured.
+        measure_cycles: Duration of the measurement.
     """
 
     force_walk_nm_per_sqrt_s: Annotated[Positive, Field(ge=1e-4, le=100.0)] = 0.2
@@ -69,14 +80,17 @@ class Estimator(Section):
 
 
 class Limits(Section):
-    """`[limits]`: torque and its rate are held to theirs; beyond the others the run ends.
+    """`[limits]`: torque and its rate are clipped; the run ends where another limit is exceeded.
 
-    jump_rad: how far from where it is expected a position may come; without it, as far as
-    speed_rad_s goes in a cycle. stuck_rad: how far the handle is expected to move within
-    stuck_cycles in which the position stays the same to the count; 0: not watched.
-    torque_error_nm: how far 0x6077 may be for torque_error_cycles from all that was commanded of
-    late; without it a tenth of torque_nm, and no less than 5 % of the rated torque; 0: not watched.
-    late_cycles: RPDOs in a row that come after the next SYNC, in real time; 0: only counted.
+    Attributes:
+        jump_rad: Largest distance of a position from the expected one. Default: as far as
+            speed_rad_s goes in a cycle.
+        stuck_rad: Distance that the handle is expected to move within stuck_cycles while the
+            position stays the same to the count; 0: not watched.
+        torque_error_nm: Largest distance of 0x6077, for torque_error_cycles, from all torques
+            commanded recently. Default: a tenth of torque_nm, and no less than 5 % of the rated
+            torque; 0: not watched.
+        late_cycles: RPDOs in a row that come after the next SYNC, in real time; 0: only counted.
     """
 
     torque_nm: Positive
@@ -108,7 +122,7 @@ class Limits(Section):
 
 
 class Run(Section):
-    """`[run]`: how long, how gently walls come and change, the format of the bus log."""
+    """`[run]`: duration, times over which walls come in and change, format of the bus log."""
 
     duration_s: Positive | None = None
     ramp_in_s: NonNegative = 0.5
@@ -117,32 +131,23 @@ class Run(Section):
     bus_log: Literal["bus.log", "bus.asc", "bus.blf", "bus.csv", "bus.trc", "bus.db"] = "bus.log"
 
 
-class LimitsChange(Section):
-    """What a schedule may change of `[limits]`."""
-
-    torque_nm: Positive | None = None
-    torque_rate_nm_per_s: Positive | None = None
-    speed_rad_s: Positive | None = None
-    energy_j: Positive | None = None
+@changing(Limits, ("torque_nm", "torque_rate_nm_per_s", "speed_rad_s", "energy_j"))
+class LimitsChange(Change):
+    """Changes of `[limits]` while the wall is rendered."""
 
 
-class WallChange(Section):
-    """Keys of `[wall]`, and `limits`, that have other values from now on."""
+@changing(Wall, (key for key in Wall.model_fields if key not in ("side", "alternate")))
+class _WallKeys(Change):
+    """Changes of `[wall]`: of all its keys but the side and the laws that take turns."""
 
-    law: str | None = None
-    position_rad: Number | None = None
-    stiffness_nm_per_rad: NonNegative | None = None
-    damping_nm_s_per_rad: NonNegative | None = None
-    deadbeat: bool | None = None
-    velocity: Literal["difference", "estimated"] | None = None
-    options: dict[str, Number] | None = None
-    tension: Literal["allow", "clamp", "budget"] | None = None
-    passivity_nm_s_per_rad: NonNegative | None = None
-    divider: Annotated[int, Field(ge=1, le=1000)] | None = None
+
+class WallChange(_WallKeys):
+    """Changes of `[wall]` and, under `limits`, of `[limits]` while the wall is rendered."""
+
     limits: LimitsChange | None = None
 
     def applied_to(self, wall: Wall, limits: Limits) -> tuple[Wall, Limits]:
-        """Wall and limits after the change."""
+        """Return wall and limits after the change."""
         update = self.model_dump(exclude={"at_s", "limits"}, exclude_none=True)
         if self.law is not None:
             update.setdefault("options", {})  # they were the other law's
@@ -152,7 +157,7 @@ class WallChange(Section):
 
 
 class Scheduled(WallChange):
-    """`[[schedule]]`: a change, and when it comes."""
+    """`[[schedule]]`: a change and its time."""
 
     at_s: NonNegative
 
@@ -207,23 +212,23 @@ class Settings(Section):
 
     @property
     def stages(self) -> list[Stage]:
-        """Wall and limits from each instant on, the first from 0."""
+        """Wall and limits, each with the time from which they are in force; the first from 0."""
         timeline = [Stage(0.0, self.wall, self.limits)]
         for change in self.schedule:
             timeline.append(Stage(change.at_s, *change.applied_to(*timeline[-1][1:])))
         return timeline
 
     def laws_in_turn(self, wall: Wall) -> list[Wall]:
-        """The walls that take turns from strike to strike: this one, and those of `alternate`.
+        """Return the walls that take turns from strike to strike: `wall`, then its `alternate`.
 
-        Options are the law's own; the others go with their defaults.
+        Options belong to a law: the others have their defaults.
         """
         others = [wall.model_copy(update={"law": law, "options": {}}) for law in wall.alternate]
         return [wall, *others]
 
     @property
     def embedded(self) -> bool:
-        """Whether the simulated drive lives in the same process as the master.
+        """True if the simulated drive lives in the process of the master.
 
         python-can's virtual bus ends at the process; on every other bus the simulated drive is a
         process of its own (`canwall drive`).
@@ -232,11 +237,11 @@ class Settings(Section):
 
     @property
     def real_time(self) -> bool:
-        """Whether SYNCs keep to the wall clock, or go out as fast as the simulation answers."""
+        """True if SYNCs keep to the clock; else they go out as fast as the simulation answers."""
         if self.bus.pace == "auto":
             return self.simulation is None or self.simulation.real_time
         return self.bus.pace == "real_time"
 
     def to_toml(self) -> str:
-        """The settings as a TOML file that `load` reads back to the same settings."""
+        """Return the settings as TOML that `load` reads back to the same settings."""
         return tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))

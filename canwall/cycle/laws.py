@@ -1,4 +1,4 @@
-"""The laws that one run may render its wall by."""
+"""The laws by which one run may render its wall."""
 
 from pathlib import Path
 from typing import Any
@@ -9,9 +9,10 @@ from canwall.walls import DEADBEAT, Law, UnknownLawError, find_law
 
 
 def run_laws(settings: Settings) -> list[Law]:
-    """The laws of the run, each once, in the order in which they are first used.
+    """Return the laws of the run, each once, in the order in which they are first used.
 
-    Raises ConfigError for a law that is not there or has not the options that it is given.
+    They are compiled here, before any drive waits for it. Raises ConfigError for a law that does
+    not exist, does not compile, or does not have the options given.
     """
     laws: dict[str, Law] = {}
     walls = [wall for stage in settings.stages for wall in settings.laws_in_turn(stage.wall)]
@@ -29,11 +30,13 @@ def run_laws(settings: Settings) -> list[Law]:
             raise ConfigError(f"run.more_laws: {error}") from None
     if len(laws) > MAX_LAWS:
         raise ConfigError(f"schedule: {len(laws)} laws; a run may change among {MAX_LAWS}")
+    for law in laws.values():
+        law.compile()
     return list(laws.values())
 
 
 def with_law(settings: Settings, law: str) -> Settings:
-    """The wall rendered by that law, +deadbeat where it is compensated."""
+    """Return the settings with the wall rendered by that law (`<law>+deadbeat`: compensated)."""
     name = absolute_law(law, Path())
     deadbeat = name.endswith(DEADBEAT)
     wall: dict[str, Any] = {"law": name.removesuffix(DEADBEAT), "deadbeat": deadbeat}
@@ -43,5 +46,5 @@ def with_law(settings: Settings, law: str) -> Settings:
 
 
 def named_law(settings: Settings) -> str:
-    """The configuration's law as a value of the axis."""
+    """Return the configured law as `with_law` takes it."""
     return settings.wall.law + (DEADBEAT if settings.wall.deadbeat else "")

@@ -82,11 +82,12 @@ def _checked(assignments: Sequence[str], settings: Settings) -> WallChange:
         law.option_values(wall.options)
     except UnknownLawError as error:
         raise ConfigError(f"law: {error}") from None
-    known = [law.name for law in run_laws(settings)]
-    if wanted.law is not None and law.name not in known:
-        raise ConfigError(
-            f"law {law.name} is none of the run's: {', '.join(known)}; list it in run.more_laws"
-        )
+    if wanted.law is not None:
+        known = [law.name for law in run_laws(settings)]
+        if law.name not in known:
+            raise ConfigError(
+                f"law {law.name} is none of the run's: {', '.join(known)}; list it in run.more_laws"
+            )
     return wanted
 
 

@@ -1,6 +1,6 @@
 """The laws of the virtual wall: a file per law, the estimator, the layers, the registry.
 
-A law is one function from the record of one wall (`WALL`) to the force that pushes the operator
+A law is a function of the record of one wall (`WALL`) that returns the force pushing the operator
 out of it. Nothing here knows of CAN, counts or drives.
 """
 
@@ -18,8 +18,11 @@ from canwall.walls.estimator import (
     start_open_loop,
 )
 from canwall.walls.interface import (
+    DEADBEAT,
     HORIZON,
     WALL,
+    Law,
+    UnknownLawError,
     call_law,
     clear_memory,
     law,
@@ -27,7 +30,7 @@ from canwall.walls.interface import (
     set_referent,
 )
 from canwall.walls.layers import TENSION, set_applied_force, wall_force
-from canwall.walls.registry import DEADBEAT, LAWS, Law, UnknownLawError, find_law
+from canwall.walls.registry import LAWS, find_law
 
 __all__ = [
     "DEADBEAT",

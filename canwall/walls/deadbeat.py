@@ -1,13 +1,13 @@
 """Deadbeat compensation for switching between two samples (5.14–5.24), over any law.
 
-At the last sample outside, the contact ahead is known from the referent: when it ends, so at
-which sample n the handle is outside again, and in which state. The last two forces of the
-contact drive it there exactly. n is predicted, not read off the sign of y (5.16 is acausal), and
-kept: the law underneath may bring the handle out a sample early.
+At the last sample outside, the referent tells the contact ahead: when it ends, hence the sample n
+at which the handle is outside again, and its state there. The last two forces of the contact drive
+it there exactly. n is predicted, not read off the sign of y (5.16 is acausal), and kept: the law
+underneath may bring the handle out a sample early.
 
 It is kept as long as the handle is where the forces should have brought it. Where it is not (the
-model is wrong, a force was clamped, the operator moves), the plan is made anew from where it is:
-what a stale plan wants of its last two forces grows with m/T².
+model is wrong, a force was clamped, the operator moves), a new plan is made from where it is: the
+last two forces of a stale plan grow with m/T² times its error.
 """
 
 import math
@@ -17,10 +17,10 @@ from canwall.physics import advance, contact_end
 from canwall.walls.interface import free_step
 
 # Places in the memory of a law that plans: periods left until sample n, the state wanted there, the
-# last of the two planned forces, and the state that is expected at the next sample.
+# last of the two planned forces, and the state expected at the next sample.
 LEFT, WANTED_Y, WANTED_V, LAST, EXPECTED_Y, EXPECTED_V = 0, 1, 2, 3, 4, 5
 
-#: Deviation from the expected state, relative to its size, that is still rounding.
+#: Largest deviation from the expected state, relative to its size, that rounding accounts for.
 _ROUNDING = 1e-7
 
 
@@ -28,9 +28,9 @@ _ROUNDING = 1e-7
 def two_forces(
     wall: Record, y: float, v: float, y_wanted: float, v_wanted: float
 ) -> tuple[float, float]:
-    """The two forces that take (y, ẏ) to the wanted state in two periods (5.24, in order).
+    """Return the two forces that take (y, ẏ) to the wanted state in two periods (5.24, in order).
 
-    The bias force is an input as well: it is taken off.
+    The bias force is an input as well, so it is subtracted.
     """
     phi, gamma = wall.phi, wall.gamma
     y1, v1 = free_step(wall, y, v, 0.0)
@@ -45,24 +45,24 @@ def two_forces(
 
 @compiled
 def first_sample_outside(wall: Record) -> tuple[int, float, float]:
-    """Of the contact that is on or begins within one period: (n, y, ẏ) of the referent.
+    """Return (n, y, ẏ) of the referent after the contact that is on or begins within one period.
 
-    n counts the periods from now to the first sample after the contact. (0, 0, 0) where there is
-    no contact, or one without an end.
+    n counts the periods from now to the first sample after the contact. (0, 0, 0) if there is no
+    contact, or one without an end.
     """
     referent = wall.referent[0]
     end, v_end = contact_end(referent, wall.y, wall.v, wall.d, wall.period)
     if not end < math.inf:
         return 0, 0.0, 0.0
     n = int(end / wall.period) + 1
-    # In what is left of the period the handle may be back in the wall.
+    # In the rest of that period the handle may enter the wall again.
     y, v, _ = advance(referent, 0.0, v_end, wall.d, 0.0, n * wall.period - end)
     return n, y, v
 
 
 @compiled
 def expect(wall: Record, force: float) -> float:
-    """Note where `force` should bring the handle until the next sample; returns the force."""
+    """Record the state that `force` should lead to at the next sample; return the force."""
     memory = wall.memory
     memory[EXPECTED_Y], memory[EXPECTED_V] = free_step(wall, wall.y, wall.v, force)
     return force
@@ -70,7 +70,7 @@ def expect(wall: Record, force: float) -> float:
 
 @compiled
 def is_as_expected(wall: Record) -> bool:
-    """Whether the handle is where the last force should have brought it."""
+    """True if the handle is where the last force should have brought it."""
     dy = abs(wall.y - wall.memory[EXPECTED_Y])
     dv = abs(wall.v - wall.memory[EXPECTED_V])
     size = abs(wall.y) + wall.period * abs(wall.v)
@@ -79,10 +79,10 @@ def is_as_expected(wall: Record) -> bool:
 
 @compiled
 def plan_contact(wall: Record) -> int:
-    """Periods left of the contact: as planned while all goes as expected, else planned anew.
+    """Return the periods left of the contact: as planned, or of a new plan after a deviation.
 
-    0 where no contact lies ahead, or one without an end. At least 2 for a new plan: two forces
-    take two periods, and a shorter contact has the handle on its way out for the second one.
+    0 if no contact lies ahead, or one without an end. At least 2 for a new plan: two forces take
+    two periods; in a shorter contact the handle is on its way out during the second.
     """
     memory = wall.memory
     left = int(memory[LEFT])
@@ -101,7 +101,7 @@ def plan_contact(wall: Record) -> int:
 
 @compiled
 def compensated(wall: Record, force: float) -> float:
-    """`force` of the law underneath, or what the plan for the end of the contact says."""
+    """Return `force`, of the law underneath, or the planned one at the end of the contact."""
     memory = wall.memory
     left = plan_contact(wall)
     if left == 1:

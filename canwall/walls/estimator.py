@@ -1,9 +1,9 @@
-"""State at the instant of actuation: a Kalman filter on [y, ẏ, d] and the in_flight forces.
+"""State at the instant of actuation: a Kalman filter on [y, ẏ, d] and the forces in flight.
 
-Between the sample y[j] and the moment at which the force computed from it takes effect lie D
-periods, and all forces of that time are already on their way. So the state at that moment is no
-extrapolation but a computation: x̂[j+D] = Φ·x̂[j] + Γ·(f_committed + d̂) (theory, section 3).
-d̂, the bias force, makes the operator's push observable, so it need not be known.
+The force computed from the sample y[j] takes effect D periods later, and all forces up to then are
+already in flight. So the state at that instant is computed, not extrapolated:
+x̂[j+1] = Φ·x̂[j] + Γ·(f + d̂) for each period up to j+D. The bias force d̂ makes the operator's push
+observable, so it need not be known.
 """
 
 import math
@@ -20,8 +20,8 @@ MAX_DELAY = 3
 
 _HOLD = [("duration", "f8"), ("phi", "f8", (2, 2)), ("gamma", "f8", (2,))]
 
-#: Filter and model of one wall. `before` and `after` are the hold equivalents over the two parts
-#: of a period that an actuation δ·T after the sample cuts it into; `full` is the whole period.
+#: Filter and model of one wall. An actuation at δ·T after the sample, δ the fraction of D, cuts a
+#: period in two: `before` and `after` are the hold equivalents over its parts, `full` over all.
 ESTIMATOR = np.dtype(
     [
         ("y", "f8"),
@@ -34,11 +34,11 @@ ESTIMATOR = np.dtype(
         ("full", _HOLD, (1,)),
         ("before", _HOLD, (1,)),
         ("after", _HOLD, (1,)),
-        # The state as it would be had the samples since `start_open_loop` not been seen.
+        # The state predicted since `start_open_loop` by the forces alone.
         ("open_loop_y", "f8"),
         ("open_loop_v", "f8"),
         ("open_loop_d", "f8"),
-        # The last forces, newest first: in_flight[0] was computed one sample ago.
+        # Forces of the last samples, newest first: in_flight[0] was computed one sample ago.
         ("in_flight", "f8", (MAX_DELAY + 1,)),
     ],
     align=True,
@@ -48,11 +48,12 @@ ESTIMATOR = np.dtype(
 def kalman_gain(
     mass: float, viscous: float, spring: float, period: float, count: float, force_walk: float
 ) -> NDArray[np.float64]:
-    """Steady-state gain on [y, ẏ, d] for a position quantised in steps of `count`; shape (3,).
+    """Return the steady-state gain on [y, ẏ, d] for a quantised position; shape (3,).
 
-    Measurement noise R = count²/12. The bias force is a random walk of force_walk [N·m/√s]. For a
-    pure mass the continuous filter then has Butterworth poles at ω = (q²/(m²·R·T))^(1/6): one
-    setting follows a light handle faster than a heavy one, as their noise allows.
+    The position is quantised in steps of `count`, so R = count²/12. The bias force is a random
+    walk of `force_walk` = q [N·m/√s]. For a pure mass the continuous filter then has Butterworth
+    poles at ω = (q²/(m²·R·T))^(1/6): one setting follows a light handle faster than a heavy one,
+    as their noise allows.
     """
     phi, gamma = zoh(mass, viscous, spring, period)
     a = np.eye(3)
@@ -101,7 +102,7 @@ def set_estimator(
 
 
 def reset_estimator(estimator: NDArray[np.void], y: float) -> None:
-    """Start at rest at y, with no force known to act."""
+    """Start at rest at y, with no bias force and no force in flight."""
     estimator["y"] = y
     estimator["v"] = estimator["d"] = 0.0
     estimator["in_flight"] = 0.0
@@ -113,8 +114,8 @@ def _hold(
 ) -> tuple[float, float]:
     phi, gamma = model.phi, model.gamma
     if model.duration > 0.0:
-        # Coulomb friction opposes the motion, but no more than stops it: at rest it holds
-        # against whatever pulls, and that is for d̂ to find out.
+        # Coulomb friction opposes the motion and at the most stops it: at rest it balances any
+        # pull, and d̂ takes that up.
         stopping = estimator.mass * v / model.duration
         force -= min(max(stopping, -estimator.coulomb), estimator.coulomb)
     return (
@@ -134,10 +135,10 @@ def correct(estimator: Record, y_sample: float) -> None:
 
 @compiled
 def restart_estimate(estimator: Record, y: float, v: float) -> None:
-    """Begin again at a sample after a time without any, with the mean velocity of that time.
+    """Restart at a sample after a gap, with the mean velocity over the gap.
 
-    The steady-state gain holds for one period between two samples: after many it would make a
-    velocity out of what was not foreseen meanwhile.
+    The steady-state gain is for samples one period apart: after a gap it would turn the whole
+    prediction error into velocity.
     """
     estimator.y = y
     estimator.v = v
@@ -145,7 +146,7 @@ def restart_estimate(estimator: Record, y: float, v: float) -> None:
 
 @compiled
 def actuation_state(estimator: Record) -> tuple[float, float]:
-    """State (ŷ, ẏ̂) at the instant at which the force computed now takes effect."""
+    """Return the state (ŷ, ẏ̂) at the instant at which the force computed now takes effect."""
     n = estimator.delay_periods
     y, v = _hold(
         estimator,
@@ -163,7 +164,7 @@ def actuation_state(estimator: Record) -> tuple[float, float]:
 def _over_period(
     estimator: Record, y: float, v: float, d: float, force: float
 ) -> tuple[float, float]:
-    """State at the next sample, by the forces on their way, of which `force` is the newest."""
+    """Return the state at the next sample under the forces in flight, `force` the newest."""
     n = estimator.delay_periods
     y, v = _hold(estimator, estimator.before[0], y, v, estimator.in_flight[n] + d)
     later = force if n == 0 else estimator.in_flight[n - 1]
@@ -172,9 +173,9 @@ def _over_period(
 
 @compiled
 def predict(estimator: Record, force: float) -> None:
-    """Take note of the force on its way, and bring the state to the next sample, x̂[j+1|j].
+    """Put `force` in flight and advance the state to the next sample, x̂[j+1|j].
 
-    `force` is what the drive will apply: after saturation and after rounding to its unit.
+    `force` is what the drive will apply, after saturation and rounding to its unit.
     """
     estimator.y, estimator.v = _over_period(estimator, estimator.y, estimator.v, estimator.d, force)
     for age in range(MAX_DELAY, 0, -1):
@@ -184,14 +185,14 @@ def predict(estimator: Record, force: float) -> None:
 
 @compiled
 def start_open_loop(estimator: Record) -> None:
-    """Keep the state before this sample and those that follow are observed."""
+    """Start a prediction without corrections at the present state; call before `correct`."""
     estimator.open_loop_y, estimator.open_loop_v = estimator.y, estimator.v
     estimator.open_loop_d = estimator.d
 
 
 @compiled
 def predict_open_loop(estimator: Record, force: float) -> None:
-    """Predict the open-loop state at the next sample, by the forces alone; before `predict`."""
+    """Advance the open-loop state to the next sample; call before `predict`."""
     estimator.open_loop_y, estimator.open_loop_v = _over_period(
         estimator, estimator.open_loop_y, estimator.open_loop_v, estimator.open_loop_d, force
     )
@@ -199,7 +200,7 @@ def predict_open_loop(estimator: Record, force: float) -> None:
 
 @compiled
 def acting_force(estimator: Record) -> float:
-    """Mean of the force from this sample to the next, of those in_flight; after `predict`."""
+    """Return the mean force from this sample to the next; call after `predict`."""
     n = estimator.delay_periods
     share = estimator.before[0].duration / estimator.full[0].duration
     force = estimator.in_flight[n]

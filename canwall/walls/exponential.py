@@ -12,7 +12,7 @@ from canwall.walls.interface import law
 #: length: depth over which the stiffness grows by a factor e.
 OPTIONS = {"length": 0.02}
 
-# Beyond it exp() would overflow; no drive reaches the forces that go with it.
+# exp() overflows far beyond it; no drive reaches these forces.
 _LARGEST_EXPONENT = 50.0
 
 
@@ -21,6 +21,6 @@ def exponential(wall: Record) -> float:
     """F = K·L·(exp(−y[j]/L) − 1) while the sample is inside."""
     if wall.y_sample >= 0.0:
         return 0.0
-    length = wall.options[0]
+    length = wall.options.length
     depth = min(-wall.y_sample / length, _LARGEST_EXPONENT)
     return wall.stiffness * length * math.expm1(depth)

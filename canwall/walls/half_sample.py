@@ -13,7 +13,7 @@ from canwall.walls.interface import law
 
 @compiled
 def predicted_force(wall: Record) -> float:
-    """−K·y(T/2) − B·ẏ(T/2) of the referent while the state at actuation is inside."""
+    """Return −K·y(T/2) − B·ẏ(T/2) of the referent while the state at actuation is inside."""
     if wall.y >= 0.0:
         return 0.0
     y_half, v_half = flow(
@@ -37,5 +37,5 @@ def half_sample(wall: Record) -> float:
 
 @law
 def half_sample_deadbeat(wall: Record) -> float:
-    """The same, with the last two forces of each contact from the deadbeat compensation."""
+    """F of half_sample, with deadbeat compensation of the last two forces of each contact."""
     return compensated(wall, predicted_force(wall))

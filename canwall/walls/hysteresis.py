@@ -1,7 +1,7 @@
 """A spring with hysteresis: it releases earlier, or softer, than it engages.
 
-Lost energy on the way out pays for what sampling adds. Both kinds in one: the wall engages at
-the surface and releases at `release` inside it, and while the handle leaves, its stiffness is
+The energy dissipated makes up for what sampling adds. Two kinds in one: the wall engages at the
+surface and releases at the depth `release`, and while the handle moves out, the stiffness is
 `softening` times K.
 """
 
@@ -19,6 +19,6 @@ def hysteresis(wall: Record) -> float:
         return 0.0
     if wall.v_sample <= 0.0:
         return -wall.stiffness * wall.y_sample
-    if wall.y_sample > -wall.options[1]:
+    if wall.y_sample > -wall.options.release:
         return 0.0
-    return -wall.options[0] * wall.stiffness * wall.y_sample
+    return -wall.options.softening * wall.stiffness * wall.y_sample

@@ -1,10 +1,11 @@
-"""What a law sees and how it is called: the record `WALL` and the decorator `law`.
+"""The interface of a law: the record `WALL` that it reads, and the class `Law` that compiles it.
 
 One sign everywhere: y < 0 is inside the wall, a force f > 0 pushes the operator out. A law reads
 the record and returns f; it does not clamp to the drive's limits and does not round.
 """
 
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,71 +15,160 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
+from canwall.errors import InputError
 from canwall.physics import PLANT, zoh
 
-#: How many numbers a law may have for options, and for its memory.
-MAX_OPTIONS = 4
+#: Numbers that the record has room for: options of a law, and its memory.
+MAX_OPTIONS = 64
 MEMORY = 8
 #: The longest contact, in periods, that a law may plan as a whole.
 HORIZON = 64
 
-#: One wall as a law sees it. Units: rad or m, s, N·m or N and their quotients.
+#: One wall. Units: rad or m, s, N·m or N and their quotients. A law that has options sees it as
+#: `wall_with`: it reads them by name, from the record `options`.
 WALL = np.dtype(
     [
-        # The wall to be rendered, and what else the law wants to be told.
+        # The wall to be rendered.
         ("stiffness", "f8"),
         ("damping", "f8"),
-        ("options", "f8", (MAX_OPTIONS,)),
-        # The model of what moves: m·ÿ + b·ẏ + k_h·y = f + d, held over one period T.
+        # The plant: m·ÿ + b·ẏ + k_h·y = f + d, with its equivalent for forces held over T.
         ("mass", "f8"),
         ("viscous", "f8"),
         ("spring", "f8"),
         ("period", "f8"),
         ("phi", "f8", (2, 2)),
         ("gamma", "f8", (2,)),
-        # The same with the continuous wall: what the rendered wall is to be like.
+        # The plant on the continuous wall: the referent that the rendered wall is to match.
         ("referent", PLANT, (1,)),
-        # Position as sampled and its velocity: what a law without a model has.
+        # Position as sampled and its velocity, for laws without a model.
         ("y_sample", "f8"),
         ("v_sample", "f8"),
-        # State at the instant at which the force takes effect, and the bias force: what a
-        # model-based law works on.
+        # State at the instant at which the force takes effect, and the bias force, for laws with
+        # a model.
         ("y", "f8"),
         ("v", "f8"),
         ("d", "f8"),
-        # What a law wants to remember from one sample to the next; zero at its first call.
+        # Kept for the law from one sample to the next; zero at its first call.
         ("memory", "f8", (MEMORY,)),
         ("plan", "f8", (HORIZON,)),
-        # The layers over the law: how tension is treated, the passivity controller's largest
-        # damping (0: off), and the energy that the wall holds of the present contact.
+        # The layers over the law: the tension policy, the passivity controller's largest damping
+        # (0: off), and the energy absorbed so far in the present contact.
         ("tension", "i8"),
         ("passivity_damping", "f8"),
         ("absorbed", "f8"),
         ("y_before", "f8"),
         ("force_before", "f8"),
+        # The law's options, in the order in which its file declares them.
+        ("option_values", "f8", (MAX_OPTIONS,)),
     ],
     align=True,
 )
-WALL_TYPE = from_dtype(WALL)
-
-#: Signature of every law: record in, force out.
-LAW_SIGNATURE = types.float64(WALL_TYPE)
 
 
-def law(function: Callable[[Any], float], keep: bool = True) -> Any:
-    """Compile a function of one WALL record into a law that compiled code calls by address.
+def wall_with(options: Iterable[str]) -> np.dtype[np.void]:
+    """Layout of WALL with `option_values` replaced by a record `options` of these names.
 
-    The address stands in a record, so laws can be exchanged between two cycles without touching
-    the code that calls them. `keep` keeps what was compiled on disk, for functions of this
-    package only: whether it has changed is not watched elsewhere (`compiled`). Returns numba's
-    CFunc. Raises numba's TypingError where the function is not within what numba compiles.
+    Size and offsets are those of WALL, so a law compiled for this layout can be called with any
+    WALL record. Without names it is WALL itself: helpers are then compiled once for all laws.
     """
-    return cfunc(LAW_SIGNATURE, cache=keep, error_model="numpy")(function)
+    names = tuple(options)
+    if not names:
+        return WALL
+    fields = dict(WALL.fields or {})
+    _, offset, *_ = fields.pop("option_values")
+    fields["options"] = np.dtype([(name, "f8") for name in names], align=True), offset
+    return np.dtype(
+        {
+            "names": list(fields),
+            "formats": [field[0] for field in fields.values()],
+            "offsets": [field[1] for field in fields.values()],
+            "itemsize": WALL.itemsize,
+        },
+        align=True,
+    )
+
+
+class UnknownLawError(InputError):
+    """A law that does not exist, does not compile, or does not have the given options."""
+
+
+class Law:
+    """A function of one WALL record that returns a force, and the options that it reads.
+
+    Compiled code calls it by `address`, which stands in a record, so laws can be exchanged between
+    two cycles without touching the code that calls them. The function is compiled at its first
+    use: most runs use one or two laws.
+
+    Attributes:
+        name: Name in configurations and summaries.
+        options: Names and defaults of what `[wall.options]` may set.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        function: Callable[[Any], float],
+        options: Mapping[str, float],
+        cached: bool = True,
+    ) -> None:
+        """Declare a law; nothing is compiled yet.
+
+        `cached` keeps the compiled code on disk, for functions of this package only: elsewhere
+        nobody watches for changes of what the function calls (`compiled`).
+        """
+        self.name = name
+        self.options = options
+        self._function = function
+        self._cached = cached
+        self._compiled: Any = None
+        self._compiling = threading.Lock()
+
+    def compile(self) -> None:
+        """Compile the function, or load it from disk, unless that is done; any thread may call.
+
+        Raises numba's NumbaError where the function is not within what numba compiles.
+        """
+        with self._compiling:
+            if self._compiled is None:
+                signature = types.float64(from_dtype(wall_with(self.options)))
+                compiling = cfunc(signature, cache=self._cached, error_model="numpy")
+                self._compiled = compiling(self._function)
+
+    @property
+    def address(self) -> int:
+        """Address of the compiled function in this process; compiles at its first use."""
+        self.compile()
+        return int(self._compiled.address)
+
+    def option_values(self, given: Mapping[str, float]) -> list[float]:
+        """All options in the order of the record, defaults where none is `given`.
+
+        Raises UnknownLawError for a name that is no option of this law.
+        """
+        for name in given:
+            if name not in self.options:
+                known = ", ".join(self.options) or "none"
+                raise UnknownLawError(f"law {self.name} has no option {name!r}; it has {known}")
+        return [given.get(name, default) for name, default in self.options.items()]
+
+
+#: Added to a law's name for its variant with deadbeat compensation.
+DEADBEAT = "+deadbeat"
+
+
+def law(function: Callable[[Any], float]) -> Law:
+    """Declare a function of this package as a law; its options are the OPTIONS of its file.
+
+    The law is named as the function, and `<name>_deadbeat` is its variant with deadbeat
+    compensation, `<name>+deadbeat`.
+    """
+    name = function.__name__.replace("_deadbeat", DEADBEAT)
+    return Law(name, function, function.__globals__.get("OPTIONS", {}))
 
 
 @intrinsic
 def call_law(typingctx: Any, address: Any, wall: Any) -> Any:
-    """Force of the law at `address` for one record of dtype WALL; from compiled code only."""
+    """Return the force of the law at `address` for one WALL record; for compiled code only."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         record = context.get_value_type(wall)
@@ -91,7 +181,10 @@ def call_law(typingctx: Any, address: Any, wall: Any) -> Any:
 def set_plant(
     wall: NDArray[np.void], mass: float, viscous: float, spring: float, period: float
 ) -> None:
-    """Write the model of what moves and its ZOH equivalent into a WALL array of shape (1,)."""
+    """Write the plant and its zero-order-hold equivalent into a WALL array of shape (1,).
+
+    Mass, viscous damping and spring in SI units, linear or angular; period in s.
+    """
     for name, value in (("mass", mass), ("viscous", viscous), ("spring", spring)):
         wall[name] = value
         wall["referent"][name] = value
@@ -102,24 +195,27 @@ def set_plant(
 def set_referent(
     wall: NDArray[np.void], stiffness: float, damping: float, options: Sequence[float] = ()
 ) -> None:
-    """Write the wall to be rendered, and its law's options, into a WALL array of shape (1,)."""
+    """Write the wall to be rendered into a WALL array of shape (1,).
+
+    `options` are the law's, as from `Law.option_values`.
+    """
     wall["stiffness"] = stiffness
     wall["damping"] = damping
     wall["referent"]["wall_stiffness"] = stiffness
     wall["referent"]["wall_damping"] = damping
-    wall["options"] = 0.0
-    wall["options"][0, : len(options)] = options
+    wall["option_values"] = 0.0
+    wall["option_values"][0, : len(options)] = options
 
 
 def clear_memory(wall: NDArray[np.void]) -> None:
-    """Clear what law and layers remember: another law takes over."""
+    """Clear the memory of law and layers, for another law to take over."""
     for name in ("memory", "plan", "absorbed", "force_before"):
         wall[name] = 0.0
 
 
 @compiled
 def free_step(wall: Record, y: float, v: float, force: float) -> tuple[float, float]:
-    """State one period later under a held force: Φ·x + Γ·(f + d)."""
+    """Return the state one period later under a held force: Φ·x + Γ·(f + d)."""
     phi, gamma = wall.phi, wall.gamma
     u = force + wall.d
     return (

@@ -1,22 +1,22 @@
-"""The layers over any law: how tension is treated, and the passivity observer and controller.
+"""The layers over any law: tension policy, passivity observer and passivity controller.
 
-Both keep the books of one contact: `absorbed` is what the operator has put into the wall and not
-yet got back, reckoned at the instants at which the forces take effect. Credit ends with the
-contact: what an earlier one left behind may not be spent on making the next one active.
+All work on the energy of the present contact: `absorbed` is what the operator has put into the
+wall and not yet got back, at the instants at which the forces take effect. It ends with the
+contact: energy left over from one must not make the next one active.
 """
 
 from canwall.compiled import Record, compiled
 from canwall.walls.interface import call_law, free_step
 
-#: What may happen where a law pulls (f < 0).
+#: Policies for a law that pulls (f < 0): allow it, clamp to 0, or allow what was absorbed before.
 TENSION = {"allow": 0, "clamp": 1, "budget": 2}
 _CLAMP, _BUDGET = TENSION["clamp"], TENSION["budget"]
 
 
 @compiled
 def wall_force(address: int, wall: Record) -> float:
-    """Force of the law at `address` after tension policy and passivity controller."""
-    # K and B may have been changed since the last call; they stand in one place for that.
+    """Return the force of the law at `address` after tension policy and passivity controller."""
+    # K and B may have changed since the last call: the referent follows them.
     wall.referent[0].wall_stiffness = wall.stiffness
     wall.referent[0].wall_damping = wall.damping
     _observe_energy(wall)
@@ -30,14 +30,14 @@ def wall_force(address: int, wall: Record) -> float:
 
 @compiled
 def set_applied_force(wall: Record, force: float) -> None:
-    """Take note of the force that will be applied: after saturation and rounding."""
+    """Record the force that will be applied, after saturation and rounding, for the observer."""
     wall.y_before = wall.y
     wall.force_before = force
 
 
 @compiled
 def _observe_energy(wall: Record) -> None:
-    """Hannaford and Ryu's observer, exact for a held force: E −= f·(y[j] − y[j−1])."""
+    """Update the observer of Hannaford and Ryu, exact for a held force: E −= f·(y[j] − y[j−1])."""
     if wall.force_before == 0.0 and wall.y >= 0.0:
         wall.absorbed = 0.0
     else:
@@ -46,7 +46,7 @@ def _observe_energy(wall: Record) -> None:
 
 @compiled
 def _tension(wall: Record, force: float) -> float:
-    """A pull as the policy allows it: all, none, or what the energy absorbed so far pays for."""
+    """Return the pull that the policy allows: all, none, or what the absorbed energy covers."""
     if wall.tension == _CLAMP:
         return 0.0
     if wall.tension == _BUDGET:
@@ -58,10 +58,10 @@ def _tension(wall: Record, force: float) -> float:
 
 @compiled
 def _passivity_control(wall: Record, force: float) -> float:
-    """Damping that takes back, within one period, what the wall has put out beyond its credit.
+    """Add the damping that takes back, within one period, the energy put out beyond E = 0.
 
-    α = −E/(T·v²), held to the largest damping that is allowed: at v ≈ 0 no damping takes energy,
-    and the division would ask for an endless one.
+    α = −E/(T·v²), limited to the largest damping allowed: at v ≈ 0 damping takes no energy, and
+    α would grow without bound.
     """
     if wall.absorbed >= 0.0:
         return force

@@ -2,7 +2,7 @@
 
 The held force gives the handle the velocity that the continuous wall would give it at the end of
 the interval, with entry and exit inside the interval accounted for. For a mass that is the mean
-of the continuous force, so an undamped wall never pulls, and it never gains energy.
+of the continuous force, so an undamped wall never pulls and never gains energy.
 """
 
 from canwall.compiled import Record, compiled
@@ -12,7 +12,7 @@ from canwall.walls.interface import free_step, law
 
 @compiled
 def force_over_interval(wall: Record, y: float, v: float) -> tuple[float, float, float]:
-    """(f, y, ẏ): the force for the interval from (y, ẏ), and the referent's state at its end."""
+    """Return (f, y, ẏ): force for the interval from (y, ẏ), and the referent's state at its end."""
     y_end, v_end, touched = advance(wall.referent[0], y, v, wall.d, 0.0, wall.period)
     if not touched:
         return 0.0, y_end, v_end

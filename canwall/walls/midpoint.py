@@ -1,6 +1,6 @@
 """The wall at the middle of the coming hold interval, by straight extrapolation.
 
-For an undamped wall the determinant of the sampled contact is exactly 1 whatever the mass: the
+For an undamped wall the determinant of the sampled contact is exactly 1 for any mass: this is the
 simplest law that gains no energy from the hold, and it needs no model beyond the state.
 """
 

@@ -1,7 +1,7 @@
 """A damped wall whose damper begins at another depth than its spring.
 
-One of Rosenberg's variants (section 5.2.2). With the damper deeper than the spring the release
-is clean; with it before the surface the approach is braked.
+One of Rosenberg's variants (section 5.2.2). A damper that begins deeper than the spring makes the
+release clean; one that begins before the surface brakes the approach.
 """
 
 from canwall.compiled import Record
@@ -16,6 +16,6 @@ OPTIONS = {"offset": -0.002}
 def offset_damper(wall: Record) -> float:
     """F = −K·y[j] inside, −B·ẏ[j] below the offset."""
     force = spring(wall)
-    if wall.y_sample < wall.options[0]:
+    if wall.y_sample < wall.options.offset:
         force -= wall.damping * wall.v_sample
     return force

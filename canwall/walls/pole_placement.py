@@ -1,8 +1,8 @@
 """Design in the digital domain (5.12, 5.13): state feedback that places the referent's poles.
 
 The sampled plant gets the eigenvalues of the continuous mass on the wall (Ackermann; the chapter
-says Aizerman). It matches how fast the motion turns and decays, not its samples: the amplitude
-of the position is off by (θ/2)/tan(θ/2).
+says Aizerman). Frequency and decay of the motion match, its samples do not: the amplitude of the
+position is off by (θ/2)/tan(θ/2).
 """
 
 import math
@@ -15,7 +15,7 @@ from canwall.walls.interface import law
 
 @compiled
 def placing_gains(wall: Record) -> tuple[float, float]:
-    """K of f = −k·x, from Ackermann's formula k = [0 1]·[Γ ΦΓ]⁻¹·p(Φ)."""
+    """Return k of f = −k·x, from Ackermann's formula k = [0 1]·[Γ ΦΓ]⁻¹·p(Φ)."""
     period = wall.period
     own_damping, own_stiffness = wall.viscous / wall.mass, wall.spring / wall.mass
     damping = own_damping + wall.damping / wall.mass
@@ -27,7 +27,7 @@ def placing_gains(wall: Record) -> tuple[float, float]:
     h1 = phi[0, 0] * g1 + phi[0, 1] * g2
     h2 = phi[1, 0] * g1 + phi[1, 1] * g2
     # By Cayley-Hamilton p(Φ) = (tr Φ − tr)·Φ + (det − det Φ)·I. Both traces are 2 − 2κ·∫h − β·h
-    # and both determinants e^(−βT): written so, what is small is not the rest of a difference.
+    # and both determinants e^(−βT): in this form small terms do not come from cancellation.
     a = 2.0 * (stiffness * g - own_stiffness * own_g) + (damping * h - own_damping * own_h)
     b = math.exp(-own_damping * period) * math.expm1(-(damping - own_damping) * period)
     area = g1 * h2 - g2 * h1  # det [Γ ΦΓ]
@@ -39,11 +39,11 @@ def placing_gains(wall: Record) -> tuple[float, float]:
 
 @compiled
 def placed_force(wall: Record) -> float:
-    """State feedback about the equilibrium under the bias force, while inside."""
+    """Return the state feedback about the equilibrium under the bias force, while inside."""
     if wall.y >= 0.0 or wall.stiffness == 0.0:
         return 0.0
     k1, k2 = placing_gains(wall)
-    # Under a bias force the wall's equilibrium has to be kept: there it holds −K·y_eq.
+    # The equilibrium under a bias force has to be that of the wall, which holds −K·y_eq there.
     y_eq = wall.d / (wall.spring + wall.stiffness)
     return -k1 * wall.y - k2 * wall.v - (wall.stiffness - k1) * y_eq
 
@@ -56,5 +56,5 @@ def pole_placement(wall: Record) -> float:
 
 @law
 def pole_placement_deadbeat(wall: Record) -> float:
-    """The same, with the last two forces of each contact from the deadbeat compensation."""
+    """F of pole_placement, with deadbeat compensation of the last two forces of each contact."""
     return compensated(wall, placed_force(wall))

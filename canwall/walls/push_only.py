@@ -2,11 +2,11 @@
 
 At the last sample outside, the contact ahead is known. Of all sequences of forces f ≥ 0 that
 bring the handle, at the first sample after the contact, into the state in which the continuous
-wall would have left it, the one with the least change from the mean forces is taken:
-min |f − f̄|² with A·f = δ, f ≥ 0. Its dual has two unknowns whatever the length of the contact:
-f = max(0, f̄ + Aᵀ·λ), solved for λ by Newton's method with halved steps where a full one does not
-help. At every sample the forces that are left are planned anew, towards the same state as long as
-all goes as planned (`deadbeat`).
+wall would have left it, the law takes the one nearest to the mean forces f̄:
+min |f − f̄|² with A·f = δ, f ≥ 0. Its dual has two unknowns for any length of the contact:
+f = max(0, f̄ + Aᵀ·λ), solved for λ by Newton's method with step halving. At every sample the
+remaining forces are planned again, towards the same state as long as the handle is where it was
+expected (`deadbeat`).
 """
 
 import math
@@ -32,9 +32,9 @@ _TOLERANCE = 1e-13
 def _residual(
     wall: Record, count: int, rest_y: float, rest_v: float, l1: float, l2: float
 ) -> tuple[float, float, float, float, float]:
-    """A·max(0, f̄ + Aᵀλ) − δ, and AᵀA over the forces that push: (r₁, r₂, J₁₁, J₁₂, J₂₂).
+    """Return A·max(0, f̄ + Aᵀλ) − δ and A·Aᵀ over the pushing forces: (r₁, r₂, J₁₁, J₁₂, J₂₂).
 
-    Positions are divided by the period, so that both rows of A are of one size.
+    Positions are divided by the period, so that both rows of A have the same scale.
     """
     phi, gamma = wall.phi, wall.gamma
     c1, c2 = gamma[0], gamma[1]
@@ -56,8 +56,8 @@ def _residual(
 
 @compiled
 def _planned_force(wall: Record, count: int, y_wanted: float, v_wanted: float) -> float:
-    """First of `count` forces to the wanted state; NaN where no pushing forces lead there."""
-    # The mean forces along the referent go into the plan; what they leave over is for λ.
+    """Return the first of `count` forces to the wanted state; NaN if no pushing ones lead there."""
+    # The plan starts from the mean forces along the referent; λ corrects what they miss.
     y, v = wall.y, wall.v
     free_y, free_v = wall.y, wall.v
     for i in range(count):
@@ -77,7 +77,7 @@ def _planned_force(wall: Record, count: int, y_wanted: float, v_wanted: float) -
             s1 = (j22 * r1 - j12 * r2) / determinant
             s2 = (j11 * r2 - j12 * r1) / determinant
         elif j11 > 0.0:
-            # A single force pushes: as far as it reaches, by the pseudo-inverse.
+            # A single force pushes: the pseudo-inverse goes as far as it reaches.
             square = (j11 + j22) ** 2
             s1 = (j11 * r1 + j12 * r2) / square
             s2 = (j12 * r1 + j22 * r2) / square
@@ -105,10 +105,10 @@ def _planned_force(wall: Record, count: int, y_wanted: float, v_wanted: float) -
 
 @compiled
 def _last_two(wall: Record) -> float:
-    """First of the last two forces, the second noted; NaN where one would have to pull."""
+    """Return the first of the last two forces, keep the second; NaN if one would have to pull."""
     memory = wall.memory
     first, second = two_forces(wall, wall.y, wall.v, memory[WANTED_Y], memory[WANTED_V])
-    # What has to be zero comes out as a rounding error of the larger one.
+    # A force that should be zero comes out as a rounding error of the larger one.
     rounding = 1e-9 * max(abs(first), abs(second))
     if min(first, second) < -rounding:
         return math.nan
@@ -118,7 +118,7 @@ def _last_two(wall: Record) -> float:
 
 @law
 def push_only(wall: Record) -> float:
-    """First force of the pushing plan for what is left of the contact; else the mean force."""
+    """F = first force of the pushing plan for the rest of the contact, or else the mean force."""
     memory = wall.memory
     left = plan_contact(wall)
     force = math.nan
@@ -129,8 +129,8 @@ def push_only(wall: Record) -> float:
     elif 2 < left <= HORIZON:
         force = _planned_force(wall, left, memory[WANTED_Y], memory[WANTED_V])
     if not force >= 0.0:
-        # No pushing leads there (any more), or the contact is too long to be planned: the mean
-        # force does not pull either, and what it loses is for the next plan to start from.
+        # No pushing forces lead there, or the contact is too long to be planned: the mean force
+        # does not pull either, and the next plan starts from where it leads.
         memory[LEFT] = 0.0
         force = max(force_over_interval(wall, wall.y, wall.v)[0], 0.0)
     return expect(wall, force)

@@ -1,23 +1,23 @@
 """The laws by name: the one list that the loop, the workbench and the messages read.
 
 A user's law is named by file and function, `my_law.py:my_law`. The function takes one record
-(`interface.WALL`) and returns the force; if the file has a dictionary OPTIONS, its entries are
-what `[wall.options]` may set, in the order in which the function finds them in `wall.options`.
+(`interface.WALL`) and returns the force. If the file has a dictionary OPTIONS, `[wall.options]`
+may set its entries, and the function reads them by name: `wall.options.growth`.
 """
 
+import difflib
 import importlib.util
 import inspect
+import keyword
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from types import FunctionType, ModuleType
+from types import FunctionType
 from typing import Any
 
 from numba import njit
 from numba.core.errors import NumbaError
 
-from canwall.errors import InputError
 from canwall.walls import (
     damped,
     exponential,
@@ -34,50 +34,9 @@ from canwall.walls import (
     two_step,
     unidirectional_damper,
 )
-from canwall.walls.interface import MAX_OPTIONS, law
+from canwall.walls.interface import DEADBEAT, MAX_OPTIONS, WALL, Law, UnknownLawError
 
-#: What is added to a law's name for its variant with deadbeat compensation.
-DEADBEAT = "+deadbeat"
-
-
-class UnknownLawError(InputError):
-    """A law that is not there, does not compile, or does not have what was asked of it."""
-
-
-@dataclass(frozen=True)
-class Law:
-    """A law, compiled: `address` is what compiled code calls it by."""
-
-    name: str
-    function: Any
-    options: Mapping[str, float] = field(default_factory=dict)
-
-    @property
-    def address(self) -> int:
-        """Address of the compiled function in this process."""
-        return int(self.function.address)
-
-    def option_values(self, given: Mapping[str, float]) -> list[float]:
-        """All options in the law's order, `given` ones first. Raises UnknownLawError."""
-        for name in given:
-            if name not in self.options:
-                known = ", ".join(self.options) or "none"
-                raise UnknownLawError(f"law {self.name} has no option {name!r}; it has {known}")
-        return [given.get(name, default) for name, default in self.options.items()]
-
-
-def _of_module(module: ModuleType) -> list[Law]:
-    """A module's law, named as the module, and its variant with deadbeat, if it has one."""
-    name = module.__name__.rpartition(".")[2]
-    options = getattr(module, "OPTIONS", {})
-    laws = [Law(name, getattr(module, name), options)]
-    with_deadbeat = getattr(module, f"{name}_deadbeat", None)
-    if with_deadbeat is not None:
-        laws.append(Law(name + DEADBEAT, with_deadbeat, options))
-    return laws
-
-
-#: Every law that comes with the project, in the order of theory.md.
+#: Every law that comes with the project, by name.
 LAWS: dict[str, Law] = {
     found.name: found
     for module in (
@@ -96,14 +55,15 @@ LAWS: dict[str, Law] = {
         push_only,
         rigid,
     )
-    for found in _of_module(module)
+    for found in vars(module).values()
+    if isinstance(found, Law)
 }
 
 _user_laws: dict[str, Law] = {}
 
 
 def find_law(name: str, deadbeat: bool = False) -> Law:
-    """The law of that name, or of that `file.py:function`. Raises UnknownLawError."""
+    """Return the law of that name, or of that `file.py:function`. Raises UnknownLawError."""
     if deadbeat:
         name += DEADBEAT
     if name in LAWS:
@@ -141,26 +101,50 @@ def _load(path: Path, function: str) -> Law:
     arguments = len(inspect.signature(written).parameters)
     if arguments != 1:
         raise UnknownLawError(f"{where}: takes {arguments} arguments; a law takes one, the wall")
-    options = getattr(module, "OPTIONS", {})
+    options = _declared_options(where, getattr(module, "OPTIONS", {}))
+    law = Law(where, _guarded(written), options, cached=False)
+    try:
+        law.compile()
+    except NumbaError as error:
+        raise UnknownLawError(f"{where}: does not compile: {_gist(error)}") from None
+    except KeyError as error:  # numba's, for a field that a record does not have
+        raise UnknownLawError(f"{where}: {_unknown_field(str(error.args[0]), options)}") from None
+    except Exception as error:  # numba lets what it trips over through
+        raise UnknownLawError(f"{where}: {type(error).__name__}: {_gist(error)}") from None
+    return law
+
+
+def _declared_options(where: str, options: object) -> Mapping[str, float]:
     if not (
         isinstance(options, dict)
         and all(isinstance(n, str) and isinstance(v, int | float) for n, v in options.items())
     ):
         raise UnknownLawError(f"{where}: OPTIONS has to be a dictionary of names and numbers")
+    for name in options:
+        if not name.isidentifier() or keyword.iskeyword(name):
+            raise UnknownLawError(
+                f"{where}: OPTIONS: {name!r} cannot be read as wall.options.{name}; rename it"
+            )
     if len(options) > MAX_OPTIONS:
-        raise UnknownLawError(f"{where}: {len(options)} options; a law may have {MAX_OPTIONS}")
-    try:
-        return Law(where, law(_guarded(written), keep=False), options)
-    except NumbaError as error:
-        raise UnknownLawError(f"{where}: does not compile: {_gist(error)}") from None
-    except Exception as error:  # numba lets what it trips over through
-        raise UnknownLawError(f"{where}: {type(error).__name__}: {_gist(error)}") from None
+        raise UnknownLawError(
+            f"{where}: {len(options)} options; a law may have up to {MAX_OPTIONS}"
+        )
+    return options
+
+
+def _unknown_field(name: str, options: Mapping[str, float]) -> str:
+    if name == "options":
+        return "reads wall.options, but its file declares no OPTIONS"
+    known = [*(WALL.names or ()), *options]
+    close = difflib.get_close_matches(name, known, n=1)
+    hint = f"; did you mean {close[0]}?" if close else ""
+    return f"reads {name}, which is neither a field of the wall nor an option{hint}"
 
 
 def _guarded(written: FunctionType) -> Callable[[Any], float]:
-    """A user's function whose exceptions become a force that is not a number, which ends the wall.
+    """Wrap a user's function so that an exception becomes a NaN force, on which the run trips.
 
-    Compiled code that is called by address can raise to nobody.
+    Code that is called by address has no caller to raise to.
     """
     compiled = njit(error_model="python", boundscheck=True)(written)
 
@@ -174,7 +158,7 @@ def _guarded(written: FunctionType) -> Callable[[Any], float]:
 
 
 def _gist(error: BaseException) -> str:
-    """The line of a message that says most: numba's first ones only name the pipeline."""
+    """Return the line of a message that says most: numba's first ones only name the pipeline."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     telling = [line for line in lines if not line.startswith(("Failed in", "File ", "During"))]
     return (telling or lines or ["no reason given"])[0]

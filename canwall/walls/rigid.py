@@ -1,8 +1,8 @@
 """A rigid stop: the limit of the mean force for K → ∞, bounded by the drive's torque alone.
 
-Its referent turns the velocity round at the surface, −restitution times, within no time. What a
-finite torque lets through is brought back to the surface at a share of its depth per period; the
-configured stiffness and damping play no part.
+Its referent reverses the velocity at the surface instantly, scaled by the restitution. Where a
+finite torque lets the handle through, it is brought back to the surface by a share of its depth
+per period. Stiffness and damping have no effect.
 """
 
 from canwall.compiled import Record, compiled
@@ -15,7 +15,7 @@ OPTIONS = {"restitution": 0.0, "recovery": 0.2}
 
 @compiled
 def _velocity_after_impact(wall: Record) -> float:
-    """Velocity of the referent at the end of an interval within which it strikes the surface."""
+    """Return the referent's velocity at the end of an interval in which it strikes the surface."""
     referent, period = wall.referent[0], wall.period
     impact = time_to_wall(referent, wall.y, wall.v, wall.d, period)
     _, v_impact = flow(wall.mass, wall.viscous, wall.spring, wall.y, wall.v, wall.d, 0.0, impact)
@@ -24,12 +24,12 @@ def _velocity_after_impact(wall: Record) -> float:
         wall.viscous,
         wall.spring,
         0.0,
-        -wall.options[0] * v_impact,
+        -wall.options.restitution * v_impact,
         wall.d,
         0.0,
         period - impact,
     )
-    # Pressed on again before the interval is over: it rests.
+    # Pressed back onto the stop before the interval is over: it rests there.
     return v_end if y_end > 0.0 else 0.0
 
 
@@ -42,6 +42,6 @@ def rigid(wall: Record) -> float:
             return 0.0
         v_wanted = _velocity_after_impact(wall)
     else:
-        v_out = -wall.options[0] * wall.v if wall.v < 0.0 else v_free
-        v_wanted = max(v_out, -wall.options[1] * wall.y / wall.period)
+        v_out = -wall.options.restitution * wall.v if wall.v < 0.0 else v_free
+        v_wanted = max(v_out, -wall.options.recovery * wall.y / wall.period)
     return max((v_wanted - v_free) / wall.gamma[1], 0.0)

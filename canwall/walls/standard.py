@@ -6,7 +6,7 @@ from canwall.walls.interface import law
 
 @compiled
 def spring(wall: Record) -> float:
-    """−K·y[j] while the sample is inside."""
+    """Return −K·y[j] while the sample is inside."""
     return -wall.stiffness * wall.y_sample if wall.y_sample < 0.0 else 0.0
 
 

@@ -1,7 +1,7 @@
-"""A damped wall whose damper is deaf to slow motion.
+"""A damped wall whose damper ignores slow motion.
 
 One of Rosenberg's variants (section 5.2.2). Below the threshold the velocity of a quantised
-position is mostly noise; leaving it out lets the damping be higher.
+position is mostly noise; without it the damping can be higher.
 """
 
 from canwall.compiled import Record
@@ -16,6 +16,6 @@ def thresholded_damper(wall: Record) -> float:
     """F = −K·y[j] − B·(ẏ[j] beyond ±threshold) while the sample is inside."""
     if wall.y_sample >= 0.0:
         return 0.0
-    threshold = wall.options[0]
+    threshold = wall.options.threshold
     beyond = wall.v_sample - min(max(wall.v_sample, -threshold), threshold)
     return -wall.stiffness * wall.y_sample - wall.damping * beyond

@@ -1,11 +1,11 @@
 """Deadbeat to the continuous wall for the whole contact, two periods at a time.
 
-Every second sample two forces are planned, such that two periods later the state is the one the
-continuous wall would have reached: exact in energy for any stiffness, through entry and exit. It
-pulls where it has to, and it believes its model.
+Every second sample two forces are planned such that two periods later the state is the one that
+the continuous wall would have reached: exact in energy for any stiffness, through entry and exit.
+It pulls where that takes a pull, and it depends on its model.
 
-A contact of an odd number of periods begins with a single force, whose error the first plan takes
-back; so a plan ends at the first sample outside, and not one after it.
+A contact of an odd number of periods begins with a single force, whose error the first plan
+corrects; so the last plan ends at the first sample outside, not one later.
 """
 
 from canwall.compiled import Record, compiled
@@ -14,7 +14,7 @@ from canwall.walls.deadbeat import first_sample_outside, two_forces
 from canwall.walls.interface import law
 from canwall.walls.mean_force import force_over_interval
 
-# Places in the law's memory: what stands there, and the planned force or the state to reach.
+# Places in the law's memory: what the next step is, and the planned force or the state to reach.
 _STEP, _SECOND, _Y, _V = 0, 1, 2, 3
 _NOTHING, _SECOND_FORCE, _FIRST_PLAN = 0.0, 1.0, 2.0
 
@@ -29,7 +29,7 @@ def _plan(wall: Record, y_wanted: float, v_wanted: float) -> float:
 
 @law
 def two_step(wall: Record) -> float:
-    """f[j], f[j+1] such that x[j+2] is the event-exact flow of the continuous wall from x[j]."""
+    """F = f[j], f[j+1] such that x[j+2] is the exact flow of the continuous wall from x[j]."""
     memory = wall.memory
     step = memory[_STEP]
     memory[_STEP] = _NOTHING

@@ -1,4 +1,4 @@
-"""A damped wall that damps only while moving in, so that it does not stick on the way out.
+"""A damped wall that damps only while the handle moves in, so that it does not stick on leaving.
 
 One of Rosenberg's variants (section 5.2.2).
 """

@@ -138,6 +138,19 @@ REFUSED: list[tuple[dict[str, object], str]] = [
     ({"limits.zzz": 1}, "limits.zzz: unknown key; known here: torque_nm, torque_rate_nm_per_s"),
     ({"simulation.hand.strike": 4}, "simulation.hand.strike: unknown key; did you mean strikes?"),
     ({"schedule": [{"at_s": 1, "lwa": "x"}]}, "schedule.0.lwa: unknown key; did you mean law?"),
+    (
+        {"schedule": [{"at_s": 1, "stiffness_nm_per_rad": -1}]},
+        "schedule.0.stiffness_nm_per_rad: has to be greater than or equal to 0, not -1",
+    ),
+    (
+        {"schedule": [{"at_s": 1, "tension": "some"}]},
+        "schedule.0.tension: has to be 'allow', 'clamp' or 'budget', not 'some'",
+    ),
+    ({"schedule": [{"at_s": 1, "side": "above"}]}, "schedule.0.side: unknown key"),
+    (
+        {"schedule": [{"at_s": 1, "limits": {"torque_nm": 0}}]},
+        "schedule.0.limits.torque_nm: has to be greater than 0, not 0",
+    ),
     # what does not go together
     ({"schedule": [{"at_s": 2}, {"at_s": 1}]}, "schedule: the entries have to be in the order"),
     (

@@ -284,7 +284,7 @@ def test_writer_that_is_killed_takes_nothing_with_it(start: Start, tmp_path: Pat
 
 @pytest.mark.parametrize(
     "body",
-    ["return math.nan", "return wall.options[int(1e6 * wall.y_sample)]", 'raise ValueError("no")'],
+    ["return math.nan", "return wall.memory[int(1e6 * wall.y_sample)]", 'raise ValueError("no")'],
 )
 @pytest.mark.parametrize("exchange", ["python-can", "native"])
 def test_law_that_fails_in_the_contact(tmp_path: Path, body: str, exchange: str) -> None:

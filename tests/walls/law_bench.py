@@ -1,4 +1,4 @@
-"""One wall and one law on a bench: what the tests of the laws share."""
+"""One wall and one law without a loop: helpers shared by the tests of the laws."""
 
 import math
 
@@ -35,38 +35,40 @@ def wall_of(ball: Ball, law: str, **options: float) -> NDArray[np.void]:
 
 
 def force_at(wall: NDArray[np.void], law: str, y: float, v: float) -> float:
-    """Force of a law for the state at actuation; the sample, another one, would give none."""
+    """Force of a law at this state at actuation; the sample lies outside and would give none."""
     wall["y_sample"], wall["v_sample"] = 1.0, 77.0
     wall["y"], wall["v"] = y, v
     return wall_force(LAWS[law].address, wall[0])
 
 
 def force_at_sample(wall: NDArray[np.void], law: str, y: float, v: float) -> float:
-    """Force of a law for a sample; the state at actuation, another one, would give none."""
+    """Force of a law at this sample; the state at actuation lies outside and would give none."""
     wall["y"], wall["v"] = 1.0, 77.0
     wall["y_sample"], wall["v_sample"] = y, v
     return wall_force(LAWS[law].address, wall[0])
 
 
-def played(ball: Ball, wall: NDArray[np.void], law: str) -> tuple[Array, Array, Array, Array]:
-    """(y, ẏ, f, absorbed) of a ball, in Python, with what the layers saw before each force."""
+def bounced_in_python(
+    ball: Ball, wall: NDArray[np.void], law: str
+) -> tuple[Array, Array, Array, Array]:
+    """(y, ẏ, f, absorbed) of a ball, stepped in Python; absorbed energy as before each force."""
     y, v = ball.height, ball.speed
-    states, forces, books = [(y, v)], [], []
+    states, forces, absorbed = [(y, v)], [], []
     address = LAWS[law].address
     for _ in range(ball.periods):
         wall["v_sample"] = (y - states[-2][0]) / ball.period if len(states) > 1 else v
         wall["y"], wall["v"], wall["y_sample"] = y, v, y
         forces.append(wall_force(address, wall[0]))
-        books.append(float(wall["absorbed"][0]))
+        absorbed.append(float(wall["absorbed"][0]))
         set_applied_force(wall[0], forces[-1])
         y, v = free_step(wall[0], y, v, forces[-1])
         states.append((y, v))
     positions, velocities = np.array(states).T
-    return positions, velocities, np.array(forces), np.array(books)
+    return positions, velocities, np.array(forces), np.array(absorbed)
 
 
 def log_floats(low: float, high: float) -> st.SearchStrategy[float]:
-    """Positive numbers, every decade as likely."""
+    """Positive numbers, uniform in their logarithm."""
     return st.floats(math.log10(low), math.log10(high)).map(lambda exponent: 10.0**exponent)
 
 
@@ -76,7 +78,7 @@ def or_zero(numbers: st.SearchStrategy[float]) -> st.SearchStrategy[float]:
 
 @st.composite
 def balls(draw: st.DrawFn, damped: bool = True, hardest: float = 3.0) -> Ball:
-    """Any mass, period and wall up to θ = `hardest`, with b, k_h, B and gravity that matter."""
+    """Any mass, period and wall up to θ = `hardest`, with b, k_h, B and gravity of an effect."""
     mass, period = draw(log_floats(1e-4, 1e2)), draw(log_floats(1e-4, 1.0))
     theta = draw(log_floats(0.02, hardest))
     rate = theta / period

@@ -32,7 +32,7 @@ DELAYS = (0.0, 1.0, 2.0, 0.35, 1.6, float(MAX_DELAY))
 
 @dataclass(frozen=True)
 class Model:
-    """What moves, as the estimator is told."""
+    """The plant, as the estimator models it."""
 
     mass: float = 1.64e-4
     viscous: float = 0.0
@@ -78,7 +78,7 @@ def bandwidth(mass: float, walk: float) -> float:
 
 @pytest.mark.parametrize("walk", [0.01, 0.2, 5.0])
 @pytest.mark.parametrize("model", MODELS)
-def test_gain_is_where_the_riccati_recursion_settles(model: Model, walk: float) -> None:
+def test_gain_is_the_limit_of_the_riccati_recursion(model: Model, walk: float) -> None:
     a, c = augmented(model), np.array([1.0, 0.0, 0.0])
     noise = np.diag([0.0, 0.0, walk**2 * PERIOD])
     covariance = np.diag([COUNT**2, 1.0, 1.0])
@@ -108,7 +108,7 @@ def test_poles_of_a_mass_are_butterworth_at_the_bandwidth(mass: float) -> None:
         poles = [cmath.log(z) / PERIOD for z in np.linalg.eigvals(error)]
         expected = [omega * cmath.exp(1j * math.radians(angle)) for angle in (120, 180, 240)]
         for pole in expected:
-            # The sampled filter comes up to the continuous one as its bandwidth falls.
+            # The sampled filter approaches the continuous one as its bandwidth falls.
             assert min(abs(p - pole) for p in poles) < 1.1 * share * omega
 
 
@@ -150,12 +150,12 @@ class Bench:
         return y, v
 
     def at_actuation(self) -> tuple[float, float]:
-        """State D periods after the sample: only forces that are on their way act until then."""
+        """State D periods after the sample: only the forces in flight act until then."""
         oldest, *others = self.forces[-(self.whole + 1) :]
         return self._state_after([(oldest, self.fraction), *((f, PERIOD) for f in others)])
 
     def step(self, force: float) -> None:
-        """To the next sample; `force` was computed from this one."""
+        """Advance to the next sample; `force` was computed from this one."""
         self.forces.append(force)
         before, after = self.forces[-(self.whole + 2) :][:2]
         self.y, self.v = self._state_after(
@@ -164,14 +164,14 @@ class Bench:
 
 
 def wanted(j: int) -> float:
-    """A force that never repeats itself within a delay."""
+    """A force that does not repeat within a delay."""
     return 0.3 * math.sin(0.7 * j) - 0.1 * math.cos(2.9 * j)
 
 
 @pytest.mark.parametrize("delay", DELAYS)
 @pytest.mark.parametrize("model", MODELS)
-def test_state_at_actuation_is_the_committed_motion(model: Model, delay: float) -> None:
-    """Told the state and the bias, it needs no correction: its motion is the plant's."""
+def test_state_at_actuation_follows_from_the_forces_in_flight(model: Model, delay: float) -> None:
+    """From the true state and bias it predicts the motion of the plant without corrections."""
     bench = Bench(model, delay, bias=-0.2, y=0.01, v=-1.5)
     estimator = make_estimator(model, delay)
     reset_estimator(estimator, 0.01)
@@ -187,7 +187,7 @@ def test_state_at_actuation_is_the_committed_motion(model: Model, delay: float) 
 
 @pytest.mark.parametrize("delay", DELAYS)
 @pytest.mark.parametrize("model", MODELS)
-def test_finds_state_and_bias_of_a_plant_that_it_knows(model: Model, delay: float) -> None:
+def test_converges_to_state_and_bias_with_a_true_model(model: Model, delay: float) -> None:
     bench = Bench(model, delay, bias=-0.3, y=0.02, v=1.2)
     estimator = make_estimator(model, delay)
     reset_estimator(estimator, 0.0)
@@ -235,7 +235,7 @@ def test_friction_of_a_sliding_handle_is_in_the_model(delay: float, v: float) ->
 def test_friction_stops_but_does_not_push() -> None:
     model = Model(coulomb=0.01)
     estimator = make_estimator(model, 1.0)
-    # What friction would take within one period is more than there is.
+    # Friction could take twice this momentum within one period.
     speed = 0.5 * model.coulomb / model.mass * PERIOD
     for v in (speed, -speed, 0.0):
         reset_estimator(estimator, 0.3)
@@ -254,7 +254,7 @@ def test_correction_is_the_gain_times_the_innovation() -> None:
     assert estimator["d"][0] == pytest.approx(0.01 * gain[2], rel=1e-10)
 
 
-def test_reset_forgets() -> None:
+def test_reset_clears_state_and_forces_in_flight() -> None:
     estimator = make_estimator(MODELS[0], 1.6)
     for j in range(5):
         correct(estimator[0], 0.1 * j)

@@ -1,4 +1,4 @@
-"""standard, damped, midpoint and half_sample: by hand, by expm, and by what they do to energy."""
+"""standard, damped, midpoint and half_sample: by hand, by expm, and their effect on energy."""
 
 import math
 
@@ -41,7 +41,7 @@ def called(address: int, wall: Record) -> float:
 
 
 def force_of(law: str, wall: NDArray[np.void], **seen: float) -> float:
-    """Force of a law that sees only these values, everything else being NaN."""
+    """Force of a law for these values, all others being NaN."""
     for name in ("y_sample", "v_sample", "y", "v", "d"):
         wall[name] = seen.get(name, math.nan)
     return called(LAWS[law].address, wall[0])
@@ -115,7 +115,7 @@ def test_half_sample_is_the_referent_half_a_period_ahead(
     )
 
 
-def test_half_sample_is_nothing_outside() -> None:
+def test_half_sample_gives_no_force_outside() -> None:
     wall = make_wall(300.0, damping=7.0, period=0.01)
     for y in (0.0, 0.02):
         assert force_of("half_sample", wall, y=y, v=-100.0, d=-50.0) == 0.0
@@ -145,7 +145,7 @@ def test_determinant_of_a_sampled_contact(mass: float, theta: float) -> None:
     # f = −K·(y·cos(θ/2) + ẏ·sin(θ/2)/ω₀)
     expected = 1.0 + theta**2 / 2.0 * math.cos(theta / 2.0) - theta * math.sin(theta / 2.0)
     assert determinant["half_sample"] == pytest.approx(expected, rel=1e-12)
-    # Wrong about the mass, midpoint does no harm: it does not use it.
+    # A wrong mass does not matter to midpoint.
     wall["mass"] *= 7.0
     phi, gamma = zoh(mass, 0.0, 0.0, period)
     gradient = [-float(wall["stiffness"][0]), -float(wall["stiffness"][0]) * period / 2.0]

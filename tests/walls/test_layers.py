@@ -1,11 +1,11 @@
-"""The layers over any law: tension policy, passivity observer and controller, and their books."""
+"""The layers over any law: tension policy, passivity observer and passivity controller."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from bouncing import Array, bounces
-from law_bench import PREDICTING, force_at, played, wall_of
+from law_bench import PREDICTING, bounced_in_python, force_at, wall_of
 
 from canwall.walls import LAWS, set_applied_force
 from canwall.workbench import Ball, sampled_ball
@@ -16,7 +16,7 @@ BALL = Ball(stiffness=25.0, periods=1000)
 
 
 def energies_put_in(y: Array, force: Array) -> list[float]:
-    """What the operator has put into the wall before each force, contact by contact."""
+    """Energy that the operator has put into the wall before each force, contact by contact."""
     held, energies = 0.0, []
     for j in range(len(force)):
         if j > 0:
@@ -29,15 +29,15 @@ def energies_put_in(y: Array, force: Array) -> list[float]:
 
 @pytest.mark.parametrize("tension", ["allow", "clamp", "budget"])
 @pytest.mark.parametrize("law", LAWS)
-def test_books_are_exact(law: str, tension: str) -> None:
+def test_absorbed_energy_is_exact(law: str, tension: str) -> None:
     ball = replace(BALL, damping=0.3, tension=tension, passivity=0.5, periods=400)
-    y, _, force, absorbed = played(ball, wall_of(ball, law), law)
+    y, _, force, absorbed = bounced_in_python(ball, wall_of(ball, law), law)
     scale = max(1.0, float(np.abs(absorbed).max()))
     np.testing.assert_allclose(absorbed, energies_put_in(y, force), rtol=0, atol=1e-12 * scale)
 
 
 @pytest.mark.parametrize("law", PREDICTING)
-def test_clamp_takes_pulls_away_and_nothing_else(law: str) -> None:
+def test_clamp_removes_pulls_and_nothing_else(law: str) -> None:
     allowed, clamped = wall_of(BALL, law), wall_of(replace(BALL, tension="clamp"), law)
     pulls = 0
     for y in np.linspace(-0.2, 0.05, 26):
@@ -58,7 +58,7 @@ def test_clamped_laws_do_not_pull(law: str) -> None:
 
 @pytest.mark.parametrize("theta", [0.1, 0.5])
 def test_clamping_makes_half_sample_active(theta: float) -> None:
-    """Started at the speed 5 of theory, section 7: +0.003 and +0.031 a bounce."""
+    """From the entry speed 5 of theory, section 7: +0.003 and +0.031 per bounce."""
     ball = Ball(stiffness=1.0, period=theta, height=0.0, speed=5.0, periods=30000)
     gains = {}
     for tension in ("allow", "clamp"):
@@ -73,33 +73,33 @@ def test_clamping_makes_half_sample_active(theta: float) -> None:
 @pytest.mark.parametrize("law", PULLING)
 def test_budget_spends_what_was_absorbed_and_no_more(law: str) -> None:
     ball = replace(BALL, tension="budget", periods=3000)
-    y, _, force, absorbed = played(ball, wall_of(ball, law), law)
+    y, _, force, absorbed = bounced_in_python(ball, wall_of(ball, law), law)
     pulling = np.flatnonzero(force < 0.0)
     assert len(pulling) > 10
     spent = force[pulling] * (y[pulling + 1] - y[pulling])
     assert np.all(spent <= np.maximum(absorbed[pulling], 0.0) + 1e-12)
 
 
-@pytest.mark.parametrize(("credit", "granted"), [(0.0, False), (0.62, False), (0.63, True)])
-def test_budget_grants_a_pull_that_is_paid_for(credit: float, granted: bool) -> None:
+@pytest.mark.parametrize(("absorbed", "granted"), [(0.0, False), (0.62, False), (0.63, True)])
+def test_budget_grants_a_pull_that_is_covered(absorbed: float, granted: bool) -> None:
     """Pulled by 5 N from 1 m/s on, 1 kg moves 0.125 m further in within 0.1 s: 0.625 J."""
     wall = wall_of(Ball(tension="budget", gravity=0.0, stiffness=0.0), "midpoint")
     wall["damping"] = -5.0
-    # The credit is booked as it comes about: a push of 1 N against a handle moving in.
-    wall["y_before"], wall["force_before"] = -0.01 + credit, 1.0
+    # Absorbed in the last period: a push of 1 N against a handle moving in.
+    wall["y_before"], wall["force_before"] = -0.01 + absorbed, 1.0
     force = force_at(wall, "midpoint", -0.01, -1.0)
-    assert wall["absorbed"][0] == pytest.approx(credit)
+    assert wall["absorbed"][0] == pytest.approx(absorbed)
     assert force == pytest.approx(-5.0 if granted else 0.0)
 
 
 def test_budget_lets_a_pull_that_takes_energy_pass() -> None:
-    """Against a handle moving out, a pull brings credit instead of costing any."""
+    """Against a handle moving out, a pull absorbs energy instead of spending any."""
     wall = wall_of(Ball(tension="budget", gravity=0.0, stiffness=4.0), "midpoint")
     assert force_at(wall, "midpoint", -0.01, 1.0) == pytest.approx(-4.0 * 0.04)
     assert wall["absorbed"][0] == 0.0
 
 
-def test_credit_ends_with_the_contact() -> None:
+def test_absorbed_energy_ends_with_the_contact() -> None:
     wall = wall_of(replace(BALL, tension="budget"), "half_sample")
     wall["absorbed"] = 3.0
     wall["y"] = wall["y_before"] = -0.1
@@ -111,7 +111,7 @@ def test_credit_ends_with_the_contact() -> None:
 
 @pytest.mark.parametrize("theta", [0.05, 0.1, 0.2])
 def test_passivity_controller_bounds_the_energy_of_a_bouncing_ball(theta: float) -> None:
-    """Plain, the standard wall feeds the ball; controlled, it has it all back after a contact."""
+    """Alone, the standard wall feeds the ball; controlled, it takes all back within the contact."""
     ball = Ball(stiffness=(theta / 0.1) ** 2, periods=3000)
     y, v, force = sampled_ball(ball, LAWS["standard"])
     assert np.cumsum(force[:-1] * np.diff(y)).max() > 10.0
@@ -119,7 +119,7 @@ def test_passivity_controller_bounds_the_energy_of_a_bouncing_ball(theta: float)
     y, v, force = sampled_ball(replace(ball, passivity=5.0), LAWS["standard"])
     force = force[:-1]
     out = np.cumsum(force * np.diff(y))
-    # No more than one contact's worth at any time, ...
+    # Never more than what one contact puts out, ...
     assert out.max() < 0.6
     # ... nothing left over in flight, ...
     in_flight = (y[:-1] >= 0.0) & (force == 0.0)
@@ -130,14 +130,14 @@ def test_passivity_controller_bounds_the_energy_of_a_bouncing_ball(theta: float)
     assert energy[:-1][in_flight].max() < 1.0 + 1e-9
 
 
-def test_passivity_controller_damps_by_what_is_missing() -> None:
-    """α = E/(T·v²), at the most the damping allowed; none where nothing is missing or v = 0."""
+def test_passivity_controller_damps_the_energy_put_out() -> None:
+    """α = E/(T·v²), up to the largest damping; none where no energy was put out or v = 0."""
     ball = Ball(stiffness=4.0, period=0.1)
 
-    def damping_force(missing: float, v: float, largest: float) -> float:
+    def damping_force(put_out: float, v: float, largest: float) -> float:
         wall = wall_of(replace(ball, passivity=largest), "midpoint")
         # From y = −1 − E to −1 under a force of 1 the wall has put out E.
-        wall["y_before"], wall["force_before"] = -1.0 - missing, 1.0
+        wall["y_before"], wall["force_before"] = -1.0 - put_out, 1.0
         plain = force_at(wall_of(ball, "midpoint"), "midpoint", -1.0, v)
         return force_at(wall, "midpoint", -1.0, v) - plain
 
@@ -145,12 +145,12 @@ def test_passivity_controller_damps_by_what_is_missing() -> None:
     assert damping_force(0.3, 2.0, 10.0) == pytest.approx(-needed * 2.0)
     assert damping_force(0.3, -2.0, 10.0) == pytest.approx(needed * 2.0)
     assert damping_force(0.3, 0.01, 10.0) == pytest.approx(-10.0 * 0.01)
-    for missing, v, largest in ((0.3, 0.0, 10.0), (-0.3, 2.0, 10.0), (0.3, 2.0, 0.0)):
-        assert damping_force(missing, v, largest) == 0.0
+    for put_out, v, largest in ((0.3, 0.0, 10.0), (-0.3, 2.0, 10.0), (0.3, 2.0, 0.0)):
+        assert damping_force(put_out, v, largest) == 0.0
 
 
-def test_noted_force_is_the_one_that_is_booked() -> None:
-    """What saturation and rounding make of a force is what the books have to hold."""
+def test_the_observer_works_on_the_applied_force() -> None:
+    """The force after saturation and rounding counts, not the one that the law returned."""
     ball = Ball(stiffness=100.0)
     wall = wall_of(ball, "midpoint")
     force = force_at(wall, "midpoint", -0.1, 0.0)

@@ -25,7 +25,7 @@ PLANTS = {
 
 
 def with_floor(ball: Ball, theta: float) -> Ball:
-    """The floor of hardness θ, its damping (given for θ = 1) as a share of the critical kept."""
+    """The floor of hardness θ, at the damping ratio that it has at θ = 1."""
     stiffness = ball.mass * (theta / ball.period) ** 2
     return replace(ball, stiffness=stiffness, damping=ball.damping * theta)
 
@@ -56,7 +56,7 @@ def test_deadbeat_meets_the_referent_at_the_first_sample_outside(
     after = slice(outside, outside + 3)
     assert y[after] == pytest.approx(y_ref[after], rel=0.0, abs=1e-9)
     assert v[after] == pytest.approx(v_ref[after], rel=0.0, abs=1e-8)
-    # It is the compensation that does so: the law alone misses.
+    # The law alone misses it.
     y_alone, _, _ = sampled_ball(ball, LAWS[law.removesuffix("+deadbeat")])
     assert abs(y_alone[outside] - y_ref[outside]) > 1e-7
 
@@ -130,7 +130,7 @@ def test_push_only_is_the_least_change_that_arrives(theta: float, plant: str, ph
     reach = np.array([np.linalg.matrix_power(phi, n - 1 - i) @ gamma for i in range(n)]).T
     free = np.linalg.matrix_power(phi, n) @ along[:, 0] + reach.sum(axis=1) * bias
     wanted = along[:, n] - free
-    # ... and the least change that scipy finds, where arriving weighs much more than changing.
+    # ... and the least change that scipy finds, with a large weight on arriving.
     # All in units of the largest force.
     unit = means.max()
     weight = 1e5 / np.abs(reach).max(axis=1, keepdims=True)

@@ -29,7 +29,7 @@ def referent_flow(ball: Ball, t: float) -> Array:
 
 
 def feedback(ball: Ball, law: str) -> tuple[float, Array]:
-    """(c, k) of a law that is f = c − k·x inside the wall, taken off its forces."""
+    """(c, k) of a law f = c − k·x inside the wall, from three of its forces."""
     speed = 1.0 / ball.period
     wall = wall_of(ball, law)
     base = force_at(wall, law, -1.0, 0.0)
@@ -39,7 +39,7 @@ def feedback(ball: Ball, law: str) -> tuple[float, Array]:
 
 
 def closed_loop(ball: Ball, law: str) -> Array:
-    """Φ − Γ·k, with ẏ in lengths per period, so that its entries are of one size."""
+    """Φ − Γ·k, with ẏ in lengths per period, so that its entries have one scale."""
     phi, gamma = zoh_of(ball.mass, ball.viscous, ball.spring, ball.period)
     loop = phi - np.outer(gamma, feedback(ball, law)[1])
     return np.asarray(loop * np.array([[1.0, 1.0 / ball.period], [ball.period, 1.0]]))
@@ -76,7 +76,7 @@ def test_midpoint_contact_has_determinant_one_for_any_mass(
 @BOUNDED
 @given(balls())
 def test_pole_placement_gives_the_eigenvalues_of_the_referent(ball: Ball) -> None:
-    # Characteristic polynomials: double eigenvalues have no digits to compare.
+    # Compared as characteristic polynomials: double eigenvalues are ill-conditioned.
     placed = np.poly(closed_loop(ball, "pole_placement"))
     wanted = np.poly(referent_flow(ball, ball.period)[:2, :2])
     np.testing.assert_allclose(placed, wanted, rtol=0.0, atol=1e-11)
@@ -111,14 +111,14 @@ def test_pole_placement_of_a_mass_in_closed_form(theta: float) -> None:
 
 
 @pytest.mark.parametrize("law", PREDICTING)
-def test_nothing_outside(law: str) -> None:
+def test_no_force_outside(law: str) -> None:
     wall = wall_of(Ball(stiffness=100.0, damping=2.0), law)
     for y, v in ((0.0, -10.0), (0.001, -10.0), (0.1, 1.0)):
         assert force_at(wall, law, y, v) == 0.0
 
 
 @pytest.mark.parametrize("law", COMPENSATED)
-def test_compensation_leaves_a_contact_without_end_alone(law: str) -> None:
+def test_compensation_does_not_touch_a_contact_without_end(law: str) -> None:
     base = law.removesuffix("+deadbeat")
     ball = Ball(stiffness=100.0, damping=30.0, gravity=9.81)
     wall, plain = wall_of(ball, law), wall_of(ball, base)

@@ -1,4 +1,4 @@
-"""The rigid stop: forces against the impact in closed form, and what a ball does on it."""
+"""The rigid stop: forces against the impact in closed form, and a ball that comes to rest."""
 
 import math
 
@@ -44,12 +44,12 @@ def test_no_force_where_nothing_is_struck(y: float, v: float) -> None:
     assert force_at(wall_of(ball, "rigid", **options), "rigid", y, v) == 0.0
 
 
-def test_depth_is_taken_back_at_a_share_per_period() -> None:
+def test_a_share_of_the_depth_is_taken_back_per_period() -> None:
     assert velocity_after(-0.01, -1.0, 0.0) == pytest.approx(0.2 * 0.01 / PERIOD)
     assert velocity_after(-0.01, -1.0, 0.0, recovery=0.5) == pytest.approx(0.5 * 0.01 / PERIOD)
-    # What still moves in is turned round, ...
+    # A handle that still moves in is reversed, ...
     assert velocity_after(-0.001, -1.0, 0.8) == pytest.approx(0.8)
-    # ... and what moves out faster than asked for is left alone: a stop does not pull.
+    # ... and one that moves out faster than wanted is not braked: a stop does not pull.
     assert velocity_after(-0.001, 3.0, 0.8) == pytest.approx(3.0 - GRAVITY * PERIOD)
 
 
@@ -61,11 +61,11 @@ def test_ball_comes_to_rest_on_the_stop(restitution: float) -> None:
     assert np.abs(y[-100:]).max() < 1e-12
     assert np.abs(v[-100:]).max() < 1e-12
     assert f[-100:-1] == pytest.approx(MASS * GRAVITY)
-    # It lets the ball in no deeper than it falls within the period of the impact.
+    # The ball gets no deeper than it falls within the period of the impact.
     assert y.min() >= v.min() * PERIOD
 
 
-def test_stiffness_and_damping_play_no_part() -> None:
+def test_stiffness_and_damping_have_no_effect() -> None:
     soft = sampled_ball(Ball(stiffness=0.0), LAWS["rigid"])
     hard = sampled_ball(Ball(stiffness=1e6, damping=50.0), LAWS["rigid"])
     assert np.array_equal(soft, hard)

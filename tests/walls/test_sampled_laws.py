@@ -74,7 +74,7 @@ def test_stiffness_and_damping_can_change_at_any_sample() -> None:
 
 
 def test_exponential_spring_ends_in_a_finite_force() -> None:
-    """Beyond e⁵⁰ the exponential is cut: no drive reaches the forces, and no double overflows."""
+    """Beyond e⁵⁰ the exponential is clipped, so that no double overflows."""
     wall = wall_of(Ball(stiffness=K), "exponential")
     deepest = force_at_sample(wall, "exponential", -1e300, -1.0)
     assert deepest == force_at_sample(wall, "exponential", -1.01, -1.0) > 1e20

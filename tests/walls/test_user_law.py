@@ -1,4 +1,4 @@
-"""A law in the user's own file: the documentation's example, and what can be wrong with one."""
+"""A law in the user's own file: the documentation's example, and errors in such files."""
 
 import runpy
 import shutil
@@ -55,7 +55,8 @@ def test_example_is_its_formula(example: str) -> None:
         undamped = stiffening(np.array(y), np.array(v), 40.0, 3.0, 0.01)
         assert force == pytest.approx(undamped - (0.2 * v if y < 0.0 else 0.0))
         fields = {name: wall[name][0] for name in ("y", "v", "period", "stiffness", "damping")}
-        assert force == pytest.approx(interpreted(SimpleNamespace(**fields, options=[3.0])))
+        options = SimpleNamespace(growth=3.0)
+        assert force == pytest.approx(interpreted(SimpleNamespace(**fields, options=options)))
 
 
 def test_example_without_growth_is_the_clamped_midpoint(example: str) -> None:
@@ -109,6 +110,27 @@ def test_options_of_an_own_law(example: str) -> None:
         law.option_values({"grwth": 1.0})
 
 
+def test_options_are_read_by_name_and_there_may_be_many(write: Write) -> None:
+    """Each of 64 options has an effect of its own on the force."""
+    names = [f"weight_{i}" for i in range(64)]
+    terms = " + ".join(f"wall.options.{name} * wall.y**{i}" for i, name in enumerate(names))
+    law = write(f"OPTIONS = dict.fromkeys({names}, 0)\ndef mine(wall):\n    return {terms}\n")
+    found = find_law(law)
+    wall = np.zeros(1, WALL)
+    wall["y"] = -1.5
+    for i, name in enumerate(names):
+        set_referent(wall, 0.0, 0.0, found.option_values({name: 2.0}))
+        assert wall_force(found.address, wall[0]) == pytest.approx(2.0 * (-1.5) ** i)
+
+
+def test_options_of_one_law_do_not_reach_the_next() -> None:
+    wall = np.zeros(1, WALL)
+    set_referent(wall, 1.0, 0.0, LAWS["hysteresis"].option_values({"release": 0.1}))
+    assert list(wall["option_values"][0, :3]) == [0.8, 0.1, 0.0]
+    set_referent(wall, 1.0, 0.0, LAWS["exponential"].option_values({}))
+    assert list(wall["option_values"][0, :3]) == [0.02, 0.0, 0.0]
+
+
 def test_helpers_constants_memory_and_plain_integers(write: Write) -> None:
     law = write(
         "from canwall.compiled import compiled\n"
@@ -140,14 +162,31 @@ def test_helpers_constants_memory_and_plain_integers(write: Write) -> None:
             "def helper(x):\n    return x\ndef mine(wall):\n    return helper(wall.y)\n",
             "does not compile: Untyped global name 'helper'",
         ),
-        ("def mine(wall):\n    return wall.stifness\n", "KeyError: 'stifness'"),
+        (
+            "def mine(wall):\n    return wall.stifness\n",
+            "reads stifness, which is neither a field of the wall nor an option; "
+            "did you mean stiffness?",
+        ),
+        (
+            "OPTIONS = {'growth': 1}\ndef mine(wall):\n    return wall.options.grwth\n",
+            "reads grwth, which is neither a field of the wall nor an option; did you mean growth?",
+        ),
+        (
+            "def mine(wall):\n    return wall.options.growth\n",
+            "reads wall.options, but its file declares no OPTIONS",
+        ),
         ("def mine(wall, y):\n    return y\n", "takes 2 arguments; a law takes one, the wall"),
         ("import math\nmath.nowhere\n", "AttributeError: module 'math' has no attribute 'nowhere'"),
         ("OPTIONS = ['a']\ndef mine(wall):\n    return 0.0\n", "OPTIONS "),
         ("OPTIONS = {'a': 'b'}\ndef mine(wall):\n    return 0.0\n", "OPTIONS "),
         (
-            "OPTIONS = dict(a=1, b=2, c=3, d=4, e=5)\ndef mine(wall):\n    return 0.0\n",
-            "5 options; a law may have 4",
+            "OPTIONS = {'a-b': 1}\ndef mine(wall):\n    return 0.0\n",
+            "OPTIONS: 'a-b' cannot be read",
+        ),
+        ("OPTIONS = {'is': 1}\ndef mine(wall):\n    return 0.0\n", "OPTIONS: 'is' cannot be read"),
+        (
+            "OPTIONS = {f'n{i}': i for i in range(65)}\ndef mine(wall):\n    return 0.0\n",
+            "65 options; a law may have up to 64",
         ),
     ],
 )
@@ -191,11 +230,11 @@ def test_run_says_it_in_one_line(write: Write, tmp_path: Path) -> None:
     "body",
     [
         "raise ValueError('no')",
-        "return wall.options[int(wall.stiffness)]",  # far beyond its end
+        "return wall.memory[int(wall.stiffness)]",  # far beyond its end
         "return 1 // int(wall.y)",
     ],
 )
-def test_exception_in_a_law_is_a_force_that_is_no_number(tmp_path: Path, body: str) -> None:
+def test_exception_in_a_law_is_a_nan_force(tmp_path: Path, body: str) -> None:
     file = tmp_path / "raises.py"
     file.write_text(f"def raises(wall):\n    if wall.y < 0.0:\n        {body}\n    return 0.25\n")
     found = find_law(f"{file}:raises")
