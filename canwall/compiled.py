@@ -60,6 +60,15 @@ def copied(record: NDArray[np.void]) -> NDArray[np.void]:
     return record.view(np.uint8).copy().view(record.dtype)
 
 
+def fields(record: NDArray[np.void]) -> Record:
+    """Return the element of a record of shape (1,), its fields as attributes in Python as well.
+
+    They are the record's own memory, read and written at a tenth of what numpy takes.
+    """
+    structure: Any = np.ctypeslib.as_ctypes_type(record.dtype)  # type: ignore[arg-type]
+    return structure.from_buffer(record)
+
+
 def data_to_number(data: bytes | bytearray) -> int:
     """Data of a CAN frame as the 64-bit number that compiled code works on.
 

@@ -80,7 +80,7 @@ def on_the_bus(*many: Settings) -> Iterator[Link]:
     with ExitStack() as stack:
         if len(many) == 1 and many[0].bus.exchange == "native":
             bus, drive_bus = (stack.enter_context(end) for end in socket_pair(many[0].bus.channel))
-            runner = simdrive.CompiledRunner(drives[0], drive_bus)
+            runner = simdrive.SocketRunner(drives[0], drive_bus)
             yield Link(bus, runner.poll, runner.compiled)
             return
         bus = stack.enter_context(open_bus(many[0]))

@@ -5,7 +5,6 @@ from canwall.simdrive.communication.dictionary import Dictionary
 from canwall.simdrive.communication.frame import Frame
 from canwall.simdrive.drive import SimulatedDrive
 from canwall.simdrive.faults import FaultyDrive
-from canwall.simdrive.loan import CompiledRunner
 from canwall.simdrive.mechanics.hand import hand_force
 from canwall.simdrive.mechanics.motion import ServoMotion
 from canwall.simdrive.mechanics.servo import (
@@ -19,12 +18,12 @@ from canwall.simdrive.mechanics.servo import (
 )
 from canwall.simdrive.profile.power_drive_system import Motion
 from canwall.simdrive.runner import BusRunner, Device
+from canwall.simdrive.socket_runner import SocketRunner
 
 __all__ = [
     "SERVO",
     "TORQUE_LIMITS",
     "BusRunner",
-    "CompiledRunner",
     "Device",
     "Dictionary",
     "FaultyDrive",
@@ -33,6 +32,7 @@ __all__ = [
     "ServoMotion",
     "ServoScales",
     "SimulatedDrive",
+    "SocketRunner",
     "encoder_counts",
     "hand_body",
     "hand_force",

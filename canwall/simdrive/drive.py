@@ -5,7 +5,7 @@ from functools import partial
 from typing import TypeAlias
 
 from canwall.bus.can_ids import LSS_REQUEST, NMT
-from canwall.simdrive.communication import rpdo, tpdo
+from canwall.compiled import data_to_number
 from canwall.simdrive.communication.dictionary import Dictionary, Key
 from canwall.simdrive.communication.emcy import (
     COMMUNICATION,
@@ -26,8 +26,11 @@ from canwall.simdrive.communication.store import ParameterStore
 from canwall.simdrive.communication.sync import SyncConsumer
 from canwall.simdrive.communication.tpdo import Tpdo
 from canwall.simdrive.mechanics.actuator import Actuator
+from canwall.simdrive.mechanics.motion import RecordedMotion
 from canwall.simdrive.profile.hardware import Hardware
 from canwall.simdrive.profile.power_drive_system import Motion, PowerDriveSystem
+from canwall.simdrive.state import DriveState
+from canwall.simdrive.steady import DECLINED, take
 
 Receive: TypeAlias = Callable[[bytes], None]
 """Takes the data of the frames with one CAN-ID."""
@@ -87,21 +90,21 @@ class SimulatedDrive:
             raise ValueError(f"SYNC period {sync_period_s} s is not positive")
         if not torque_delay_cycles >= 0.0:
             raise ValueError(f"torque delay of {torque_delay_cycles} cycles is negative")
+        self.state = DriveState()
+        """All that a cycle reads and writes."""
+        self._record, self._fields = self.state.record, self.state.fields
+        self._fields.period = sync_period_s
         self._motion = motion
+        self._recorded = motion if isinstance(motion, RecordedMotion) else None
+        if self._recorded and self._recorded.record is not None:
+            self._fields.motion = self._recorded.record.ctypes.data
         self._actuator = Actuator(motion, sync_period_s, torque_delay_cycles)
         self._sync_period_s = sync_period_s
         self._memory = memory or Memory(None)
         self._bitrate = bitrate
         self.real_time = real_time
-        """Whether the physics move by the time that ``tick`` tells, not by the count of SYNCs."""
-        self.syncs = 0
-        """How many SYNCs have been on the bus."""
-        self.passes_syncs = True
-        """Whether a SYNC that arrives is one on the bus; False: ``pass_sync`` tells of those."""
-        self._passed_s = 0.0
-        """Time that the slope of the torque (0x6087) has not been told of."""
-        self._without_sync_s = 0.0
-        """Time since the last SYNC, or since then and a slow-down going on without it."""
+        """True if the physics move by the time that ``tick`` tells, not by the count of SYNCs."""
+        self._passes_syncs = True
         self._hardware = hardware or Hardware()
         self._extensions: list[Callable[[Dictionary], None]] = []
         self._build(dictionary, node_id)
@@ -111,16 +114,17 @@ class SimulatedDrive:
         self._dictionary = dictionary
         self._node_id = node_id
         self._silent_until_ns = 0
-        self._clock = Clock()
+        dictionary.keep_in(self.state)
+        self._clock = Clock(self.state)
         self._outbox: list[Frame] = []
         send = self._outbox.append
         self._emcy = EmergencyProducer(dictionary, send)
         self._store = ParameterStore(dictionary, self._memory)
         self._pds = PowerDriveSystem(
-            dictionary, self._motion, self._emcy, self._hardware, self._sync_period_s
+            dictionary, self.state, self._motion, self._emcy, self._hardware, self._sync_period_s
         )
         self._sync = SyncConsumer(
-            dictionary, self._clock, self._emcy, self._route, self._connection_lost
+            dictionary, self.state, self._emcy, self._route, self._connection_lost
         )
         self._sdo = SdoServer(dictionary, self._clock, send)
         self._heartbeat_producer = HeartbeatProducer(dictionary, self._clock, send)
@@ -131,20 +135,12 @@ class SimulatedDrive:
             dictionary, self._clock, send, self._heartbeat_lost, self._heartbeat_regained
         )
         self._rpdos = [
-            Rpdo(
-                dictionary,
-                index,
-                self._clock,
-                self._sync,
-                self._emcy,
-                self._route,
-                self._connection_lost,
-            )
-            for index in dictionary.indices(rpdo.COMMUNICATION)
+            Rpdo(dictionary, index, self.state, self._emcy, self._route, self._connection_lost)
+            for index in dictionary.indices(Rpdo.communication)
         ]
         self._tpdos = [
-            Tpdo(dictionary, index, self._clock, send, self._route)
-            for index in dictionary.indices(tpdo.COMMUNICATION)
+            Tpdo(dictionary, index, self.state, send, self._route)
+            for index in dictionary.indices(Tpdo.communication)
         ]
         self._lss = LssSlave(
             dictionary,
@@ -160,6 +156,21 @@ class SimulatedDrive:
         for serve in self._extensions:
             serve(dictionary)
         self._route()
+
+    @property
+    def syncs(self) -> int:
+        """Number of SYNCs that have been on the bus."""
+        return int(self._fields.syncs)
+
+    @property
+    def passes_syncs(self) -> bool:
+        """True if a SYNC that arrives is one on the bus; False: ``pass_sync`` tells of those."""
+        return self._passes_syncs
+
+    @passes_syncs.setter
+    def passes_syncs(self, passes: bool) -> None:
+        self._passes_syncs = passes
+        self._settle()
 
     @property
     def axis(self) -> PowerDriveSystem:
@@ -224,6 +235,10 @@ class SimulatedDrive:
             can_id: 11-bit identifier.
             data: 0 to 8 bytes.
         """
+        if self._fields.steady:
+            sent = take(self._record, can_id, len(data), data_to_number(data))
+            if sent != DECLINED:
+                return [(tpdo, bytes(payload)) for tpdo, payload in self._sync_frames[:sent]]
         receive = self._routes.get(can_id)
         if receive is None:
             return []
@@ -262,11 +277,28 @@ class SimulatedDrive:
 
     def take_outbox(self) -> list[Frame]:
         """Return the frames that what was done to the drive makes it send."""
+        self._settle()
         if not self._outbox:
             return []
         frames = self._outbox.copy()
         self._outbox.clear()
         return frames if self._clock.now_ns >= self._silent_until_ns else []
+
+    def _settle(self) -> None:
+        """See whether what comes next is for compiled code (`steady`)."""
+        self._fields.steady = (
+            self._pdos_are_steady
+            and self._pds.steady
+            and self._actuator.steady
+            and self._passes_syncs
+            and not self.real_time
+            and not self._sync.counted
+            and not self._emcy.present
+            and self._clock.now_ns >= self._silent_until_ns
+            and self._recorded is not None
+            and self._recorded.record is not None
+            and all(pdo.quiet for pdo in self._event_tpdos)
+        )
 
     def _fall_silent(self, duration_ms: int) -> None:
         self._silent_until_ns = self._clock.now_ns + duration_ms * NS_PER_MS
@@ -297,6 +329,23 @@ class SimulatedDrive:
             routes = {LSS_REQUEST: self._lss.receive, self._sync.can_id: self._on_sync}
         self._routes = routes
         self._remote_routes = remote_routes
+        self._settle_pdos()
+
+    def _settle_pdos(self) -> None:
+        """Tell compiled code what SYNC moves, if these are PDOs for it."""
+        fields, rpdos, tpdos = self._fields, self._sync_rpdos, self._sync_tpdos
+        self._pdos_are_steady = (
+            len(rpdos) == 1
+            and rpdos[0].steady
+            and self._routes.get(rpdos[0].can_id) == rpdos[0].receive
+            and all(pdo.steady for pdo in tpdos)
+        )
+        fields.sync_id = self._sync.can_id
+        fields.sync_rpdo = rpdos[0].number if rpdos else 0
+        fields.sync_tpdo_count = len(tpdos)
+        for place, pdo in enumerate(tpdos):
+            fields.sync_tpdos[place] = pdo.number
+        self._sync_frames = [(pdo.can_id, pdo.payload) for pdo in tpdos]
 
     def _receive_of(self, received: Rpdo) -> Receive:
         return received.receive if received.synchronous else self._at_once(received.receive)
@@ -316,24 +365,25 @@ class SimulatedDrive:
         if actuator.delayed and self._pds.motor_free:
             actuator.cut()
         actuator.advance(self._pds.torque_nm, periods)
-        self._passed_s += periods * self._sync_period_s
+        self._fields.passed += periods * self._sync_period_s
 
     def pass_sync(self) -> None:
         """Let the world go on to a SYNC on the bus, whether the drive hears it or not."""
-        self.syncs += 1
-        self._without_sync_s = 0.0
+        fields = self._fields
+        fields.syncs += 1
+        fields.without_sync = 0.0
         if self.real_time:
             return
-        if self.syncs > 1:
+        if fields.syncs > 1:
             self._pass(1.0)
         else:
             # Before the first SYNC there is no period, but the first step of a slope is due.
-            self._passed_s = self._sync_period_s
+            fields.passed = self._sync_period_s
 
     def _apply_torque(self) -> None:
         """Let the target torque hold from now on."""
-        self._pds.apply_torque(self._passed_s)
-        self._passed_s = 0.0
+        self._pds.apply_torque(self._fields.passed)
+        self._fields.passed = 0.0
         if not self._actuator.direct:
             self._pds.show_torque(self._actuator.torque_nm(self._pds.torque_nm))
 
@@ -343,15 +393,16 @@ class SimulatedDrive:
         A tick counts for a few milliseconds at the most: where the program itself was held up,
         the SYNC may be waiting.
         """
-        self._without_sync_s += min(dt, _LONGEST_TICK_S)
-        while self._without_sync_s > _SYNC_GONE_S + self._sync_period_s:
-            self._without_sync_s -= self._sync_period_s
+        fields = self._fields
+        fields.without_sync += min(dt, _LONGEST_TICK_S)
+        while fields.without_sync > _SYNC_GONE_S + self._sync_period_s:
+            fields.without_sync -= self._sync_period_s
             self._pass(1.0)
             self._apply_torque()
             self._pds.sample()
 
     def _on_sync(self, data: bytes) -> None:
-        if self.passes_syncs:
+        if self._passes_syncs:
             self.pass_sync()
         if not self._sync.receive(data):
             return

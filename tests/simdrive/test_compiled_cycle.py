@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rig import settings_with
 
-from canwall.cycle import PowerDriveSystem, run_laws
+from canwall.cycle import WallAxis, run_laws
 from canwall.record import TIMING_COLUMNS, Ring
 from canwall.run import drive_dictionary, make_axis, make_exchange, on_the_bus, render
 
@@ -25,7 +25,7 @@ def rendered(exchange: str, overrides: dict[str, Any], asks_at: int = 0) -> Any:
     read: list[int] = []
     with on_the_bus(settings) as link:
         laws, ring = run_laws(settings), Ring.create()
-        axis: PowerDriveSystem = make_axis(link, settings, drive_dictionary(settings), laws, ring)
+        axis: WallAxis = make_axis(link, settings, drive_dictionary(settings), laws, ring)
         link.log = lambda time_s, message, received: frames.append(
             (message.arbitration_id, bytes(message.data))
         )

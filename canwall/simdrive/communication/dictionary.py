@@ -10,6 +10,7 @@ from canopen.objectdictionary import ODVariable, datatypes
 
 from canwall.eds import DictionaryError, load_eds
 from canwall.simdrive.communication.abort import AbortCode, AccessError
+from canwall.simdrive.state import OBJECTS, DriveState
 
 MANDATORY = {
     0x1000: ("device type", datatypes.UNSIGNED32),
@@ -172,6 +173,37 @@ class Entry:
             self.react(value)
 
 
+class StateEntry(Entry):
+    """An entry whose value stands in the drive's record, at `place` of its values."""
+
+    __slots__ = ("_values", "place")
+
+    def __init__(self, values: memoryview, place: int, entry: Entry) -> None:
+        """Take the place of an entry that nobody checks or watches yet."""
+        self._values = values
+        self.place = place
+        super().__init__(
+            entry.index,
+            entry.subindex,
+            entry.codec,
+            entry.default,
+            entry.access,
+            entry.pdo_mapping,
+            entry.low,
+            entry.high,
+        )
+        self.value = entry.value
+
+    @property
+    def value(self) -> int:
+        """Present value."""
+        return self._values[self.place]
+
+    @value.setter
+    def value(self, value: int) -> None:
+        self._values[self.place] = value
+
+
 class Dictionary:
     """All entries by (index, sub-index), for one node-ID."""
 
@@ -185,6 +217,7 @@ class Dictionary:
         self.node_id = node_id
         self._entries: dict[Key, Entry] = {}
         self._supplied: dict[Key, int] = {}
+        self._state: DriveState | None = None
         self.dummies: dict[int, int] = {}
         """Sizes in bytes of the data types that an RPDO may map to skip bytes ([DummyUsage])."""
         for variable in variables:
@@ -298,10 +331,30 @@ class Dictionary:
         entry = self._entries.get((index, subindex))
         if entry is None:
             known = self._supplied.get((index, subindex), absent)
-            return Entry(index, subindex, None, known)
+            return self._kept(Entry(index, subindex, None, known))
         if not isinstance(entry.default, int):
             raise self.error(index, subindex, "not an integer")
         return entry
+
+    def keep_in(self, state: DriveState) -> None:
+        """Let the values of `state.OBJECTS` stand in a drive's record from now on.
+
+        Raises:
+            DictionaryError: one of them is not an integer of up to 32 bits.
+        """
+        self._state = state
+        for index in OBJECTS:
+            if (index, 0) in self:
+                entry = self.number(index, absent=0)
+                if entry.size is None or entry.size > 4:
+                    raise self.error(index, 0, "not an integer of up to 32 bits")
+                self._entries[index, 0] = self._kept(entry)
+
+    def _kept(self, entry: Entry) -> Entry:
+        """Return the entry, or the one that stands for it in the record."""
+        if self._state is None or entry.subindex or entry.index not in OBJECTS:
+            return entry
+        return StateEntry(self._state.values, OBJECTS.index(entry.index), entry)
 
     def indices(self, within: range) -> list[int]:
         """Return the objects that the EDS has in a range of indices, in order."""

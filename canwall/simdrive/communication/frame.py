@@ -1,8 +1,9 @@
 """What passes between the services and the bus, and the clock of the protocol timers."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TypeAlias
+
+from canwall.simdrive.state import DriveState
 
 Frame: TypeAlias = tuple[int, bytes]
 """A CAN data frame: 11-bit identifier and 0 to 8 bytes."""
@@ -24,12 +25,22 @@ NS_PER_US = 1_000
 NS_PER_100_US = 100_000
 
 
-@dataclass(slots=True)
 class Clock:
     """Protocol time in whole nanoseconds, so that sums of ticks stay exact."""
 
-    now_ns: int = 0
+    def __init__(self, state: DriveState) -> None:
+        """Begin at zero."""
+        self._state = state.fields
+        self._state.now_ns = self._state.ticked_ns = 0
+
+    @property
+    def now_ns(self) -> int:
+        """Present time."""
+        now_ns: int = self._state.now_ns
+        return now_ns
 
     def advance(self, dt: float) -> None:
-        """Let ``dt`` seconds pass."""
-        self.now_ns += round(dt * 1e9)
+        """Let ``dt`` seconds have passed since the last call."""
+        state = self._state
+        state.ticked_ns += round(dt * 1e9)
+        state.now_ns = state.ticked_ns

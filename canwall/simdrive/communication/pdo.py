@@ -14,7 +14,8 @@ from canwall.simdrive.communication.cob_id import (
     check_can_id,
     check_unchanged_while_valid,
 )
-from canwall.simdrive.communication.dictionary import Dictionary, Entry
+from canwall.simdrive.communication.dictionary import Dictionary, Entry, StateEntry
+from canwall.simdrive.state import DriveState
 
 CYCLIC = range(1, 241)
 ACYCLIC = 0
@@ -24,7 +25,8 @@ EVENT_DRIVEN = (254, 255)
 _TRANSMISSION_TYPES = frozenset((ACYCLIC, *CYCLIC, *EVENT_DRIVEN))
 """241 to 251 are reserved."""
 
-_MAX_BYTES = 8
+MAX_BYTES = 8
+MAPPING_OFFSET = 0x200
 
 
 class Pdo:
@@ -32,35 +34,42 @@ class Pdo:
 
     transmit: bool
     """Direction, as the subclass has it."""
+    communication: range
+    """Indices of the communication parameters in this direction."""
 
     def __init__(
         self,
         dictionary: Dictionary,
-        communication: int,
-        mapping: int,
+        index: int,
+        state: DriveState,
         changed: Callable[[], None],
     ) -> None:
         """Serve one pair of objects.
 
         Args:
             dictionary: has the entries.
-            communication: index of the communication parameter.
-            mapping: index of the mapping parameter.
+            index: of the communication parameter.
+            state: of the drive.
             changed: called when the PDO became active or inactive, or moved.
 
         Raises:
             DictionaryError: the EDS lacks a part of the PDO, or maps what cannot be mapped.
         """
-        for key in ((communication, 1), (communication, 2), (mapping, 0)):
+        mapping = index + MAPPING_OFFSET
+        for key in ((index, 1), (index, 2), (mapping, 0)):
             if key not in dictionary:
                 raise dictionary.error(*key, "missing")
         self._dictionary = dictionary
         self._changed = changed
-        self._cob_id = dictionary.number(communication, 1, absent=NOT_VALID)
-        self._type = dictionary.number(communication, 2, absent=255)
+        self.number = index - self.communication.start
+        """Place among the PDOs of its direction, from 0."""
+        self._record, self._state = state.record, state.fields
+        self._pdo = (self._state.tpdos if self.transmit else self._state.rpdos)[self.number]
+        self._cob_id = dictionary.number(index, 1, absent=NOT_VALID)
+        self._type = dictionary.number(index, 2, absent=255)
         remote = (SYNCHRONOUS_REMOTE, EVENT_DRIVEN_REMOTE) if self.transmit else ()
         self._type.allow(_TRANSMISSION_TYPES.union(remote))
-        self._event_time = dictionary.number(communication, 5, absent=0)
+        self._event_time = dictionary.number(index, 5, absent=0)
         self._count = dictionary.number(mapping, 0, absent=0)
         self._mapping = [
             dictionary.number(mapping, subindex, absent=0)
@@ -99,6 +108,11 @@ class Pdo:
         """Whether SYNC moves the PDO."""
         return self._type.value not in (EVENT_DRIVEN_REMOTE, *EVENT_DRIVEN)
 
+    @property
+    def in_state(self) -> bool:
+        """True if the drive's record has all that it carries."""
+        return bool(self._pdo.field_count == len(self._entries))
+
     def configure(self) -> None:
         """Compile the mapping of an active PDO; called whenever a parameter has changed.
 
@@ -106,24 +120,33 @@ class Pdo:
             AccessError: the mapping is not possible. What is written was checked before, so only
                 the power-on values can be wrong.
         """
-        formats, entries = self._compile(self._count.value if self.active else 0)
-        self._struct = Struct("<" + formats)
-        self._entries = entries
+        objects = self._compile(self._count.value if self.active else 0)
+        self._struct = Struct("<" + "".join(form for form, _ in objects))
+        self._entries = [entry for _, entry in objects if entry is not None]
+        self._lay_out(objects)
 
-    def _compile(self, count: int) -> tuple[str, list[Entry]]:
-        """Return the struct format and the entries of the first ``count`` mapped objects."""
+    def _lay_out(self, objects: list[tuple[str, Entry | None]]) -> None:
+        """Write to the record where the objects are in the data, as far as it has them."""
+        pdo = self._pdo
+        pdo.can_id, pdo.length = self.can_id, self._struct.size
+        shift = count = 0
+        for form, entry in objects:
+            bits = 8 * Struct("<" + form).size
+            if isinstance(entry, StateEntry):
+                field = pdo.fields[count]
+                field.place, field.shift, field.bits = entry.place, shift, bits
+                count += 1
+            shift += bits
+        pdo.field_count = count
+
+    def _compile(self, count: int) -> list[tuple[str, Entry | None]]:
+        """Return struct format and entry (None: dummy) of the first ``count`` mapped objects."""
         if count > len(self._mapping):
             raise AccessError(AbortCode.TOO_HIGH)
-        formats = ""
-        entries = []
-        for mapped in self._mapping[:count]:
-            form, entry = self._resolve(mapped.value)
-            formats += form
-            if entry is not None:
-                entries.append(entry)
-        if Struct("<" + formats).size > _MAX_BYTES:
+        objects = [self._resolve(mapped.value) for mapped in self._mapping[:count]]
+        if Struct("<" + "".join(form for form, _ in objects)).size > MAX_BYTES:
             raise AccessError(AbortCode.PDO_LENGTH)
-        return formats, entries
+        return objects
 
     def _resolve(self, mapped: int) -> tuple[str, Entry | None]:
         """Return format and entry of a mapping value (index, sub-index, bits); None: dummy."""

@@ -2,16 +2,31 @@
 
 from collections.abc import Callable
 
+import numpy as np
+from numpy.typing import NDArray
+
 from canwall.bus.can_ids import SYNC
+from canwall.compiled import Record, compiled
 from canwall.simdrive.communication.abort import AbortCode, AccessError
 from canwall.simdrive.communication.cob_id import BIT_30, CAN_ID, NOT_VALID, check_can_id
 from canwall.simdrive.communication.dictionary import Dictionary, Key
 from canwall.simdrive.communication.emcy import SYNC_LENGTH, SYNC_LOST, EmergencyProducer
-from canwall.simdrive.communication.frame import NS_PER_US, Clock
+from canwall.simdrive.communication.frame import NS_PER_US
+from canwall.simdrive.state import NEVER, DriveState
 
 _COUNTER_OVERFLOW: Key = (0x1019, 0)
 _CYCLE_PERIOD: Key = (0x1006, 0)
 _OVERFLOW_VALUES = frozenset((0, *range(2, 241)))
+
+
+@compiled
+def begin_cycle(drives: NDArray[np.void]) -> None:
+    """Begin the communication cycle and the window of a SYNC that comes now (0x1006, 0x1007)."""
+    drive: Record = drives[0]
+    if drive.sync_period_ns:
+        drive.sync_deadline_ns = drive.now_ns + drive.sync_period_ns * 3 // 2
+    if drive.sync_window_ns:
+        drive.sync_window_end_ns = drive.now_ns + drive.sync_window_ns
 
 
 class SyncConsumer:
@@ -25,7 +40,7 @@ class SyncConsumer:
     def __init__(
         self,
         dictionary: Dictionary,
-        clock: Clock,
+        state: DriveState,
         emcy: EmergencyProducer,
         changed: Callable[[], None],
         lost: Callable[[int, Key], None],
@@ -34,12 +49,12 @@ class SyncConsumer:
 
         Args:
             dictionary: has the entries.
-            clock: protocol time.
+            state: of the drive.
             emcy: told of SYNCs of the wrong length, and of those that come again.
             changed: called when the CAN-ID was written.
             lost: called with error code and (index, sub-index) when SYNC is missed.
         """
-        self._clock = clock
+        self._record, self._state = state.record, state.fields
         self._emcy = emcy
         self._lost = lost
         self._cob_id = dictionary.number(0x1005, absent=SYNC)
@@ -60,16 +75,14 @@ class SyncConsumer:
         return can_id
 
     @property
-    def in_window(self) -> bool:
-        """Whether a synchronous PDO that comes now is for this cycle."""
-        end_ns = self._window_end_ns
-        return end_ns is None or self._clock.now_ns <= end_ns
+    def counted(self) -> bool:
+        """True if SYNC has to carry its counter."""
+        return bool(self._length)
 
     def reset(self) -> None:
         """Take the parameters as they stand, and wait for the first SYNC."""
-        self._period_ns = self._period_us.value * NS_PER_US
-        self._window_ns = self._window_us.value * NS_PER_US
-        self._timed = bool(self._period_ns or self._window_ns)
+        self._state.sync_period_ns = self._period_us.value * NS_PER_US
+        self._state.sync_window_ns = self._window_us.value * NS_PER_US
         self._length = 1 if self._overflow.value else 0
         self._emcy.gone(SYNC_LOST, _CYCLE_PERIOD)
         self._emcy.gone(SYNC_LENGTH, _COUNTER_OVERFLOW)
@@ -79,8 +92,7 @@ class SyncConsumer:
         """Forget the SYNCs that have come."""
         self.counter = 0
         """Of the last SYNC; 0: it carries none."""
-        self._deadline_ns: int | None = None
-        self._window_end_ns: int | None = None
+        self._state.sync_deadline_ns = self._state.sync_window_end_ns = NEVER
 
     def receive(self, data: bytes) -> bool:
         """Take a SYNC; return whether it is one, of the length that 0x1019 demands."""
@@ -92,18 +104,13 @@ class SyncConsumer:
         if self._emcy.present:
             self._emcy.gone(SYNC_LENGTH, _COUNTER_OVERFLOW)
             self._emcy.gone(SYNC_LOST, _CYCLE_PERIOD)
-        if self._timed:
-            now_ns = self._clock.now_ns
-            if self._period_ns:
-                self._deadline_ns = now_ns + self._period_ns * 3 // 2
-            if self._window_ns:
-                self._window_end_ns = now_ns + self._window_ns
+        begin_cycle(self._record)
         return True
 
     def tick(self) -> None:
         """Report a SYNC that is missed, once."""
-        if self._deadline_ns is not None and self._clock.now_ns >= self._deadline_ns:
-            self._deadline_ns = None
+        if self._state.now_ns >= self._state.sync_deadline_ns:
+            self._state.sync_deadline_ns = NEVER
             self._lost(SYNC_LOST, _CYCLE_PERIOD)
 
     def _check_cob_id(self, value: int) -> None:

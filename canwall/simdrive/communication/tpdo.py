@@ -2,14 +2,16 @@
 
 from collections.abc import Callable
 
+import numpy as np
+from numpy.typing import NDArray
+
 from canwall.simdrive.communication.abort import AbortCode, AccessError
 from canwall.simdrive.communication.cob_id import BIT_30
 from canwall.simdrive.communication.dictionary import Dictionary
-from canwall.simdrive.communication.frame import NS_PER_100_US, NS_PER_MS, Clock, Send
+from canwall.simdrive.communication.frame import NS_PER_100_US, NS_PER_MS, Send
 from canwall.simdrive.communication.pdo import CYCLIC, EVENT_DRIVEN, SYNCHRONOUS_REMOTE, Pdo
+from canwall.simdrive.state import CYCLIC_OBJECTS, DriveState
 
-COMMUNICATION = range(0x1800, 0x1A00)
-_MAPPING_OFFSET = 0x200
 _HIGHEST_COUNTER = 240
 
 
@@ -24,12 +26,13 @@ class Tpdo(Pdo):
     """
 
     transmit = True
+    communication = range(0x1800, 0x1A00)
 
     def __init__(
         self,
         dictionary: Dictionary,
         index: int,
-        clock: Clock,
+        state: DriveState,
         send: Send,
         changed: Callable[[], None],
     ) -> None:
@@ -38,30 +41,46 @@ class Tpdo(Pdo):
         Args:
             dictionary: has the entries.
             index: of the communication parameter.
-            clock: protocol time.
+            state: of the drive.
             send: takes the frames.
             changed: called when the PDO became active or inactive, or moved.
 
         Raises:
             DictionaryError: as Pdo.
         """
-        self._clock = clock
         self._send = send
         self._inhibit_time = dictionary.number(index, 3, absent=0)
         self._inhibit_time.check = self._check_inhibit_time
         self._start_value = dictionary.number(index, 6, absent=0)
         self._start_value.check = self._check_start_value
-        super().__init__(dictionary, index, index + _MAPPING_OFFSET, changed)
+        super().__init__(dictionary, index, state, changed)
 
     @property
     def answers_remote(self) -> bool:
-        """Whether remote frames are answered: bit 30 of the COB-ID is clear."""
+        """True if remote frames are answered: bit 30 of the COB-ID is clear."""
         return not self._cob_id.value & BIT_30
 
     @property
     def event_driven(self) -> bool:
-        """Whether a change of the content is sent at once."""
+        """True if a change of the content is sent without waiting for a SYNC."""
         return self._type.value in EVENT_DRIVEN
+
+    @property
+    def steady(self) -> bool:
+        """True if `steady.take` may send it, with every SYNC."""
+        return self._divider == 1 and self.in_state
+
+    @property
+    def payload(self) -> memoryview:
+        """Data that `steady.take` has made up, in the record."""
+        data: NDArray[np.int64] = self._record["tpdos"]["data"][0, self.number : self.number + 1]
+        return data.view(np.uint8).data[: self._struct.size]
+
+    @property
+    def quiet(self) -> bool:
+        """True if it is sent on events, and none will come of SYNCs and torques alone."""
+        constant = all(entry.index not in CYCLIC_OBJECTS for entry in self._entries)
+        return constant and not self._event_ns and self._sent == self._payload()
 
     def configure(self) -> None:
         """Compile the mapping and begin anew."""
@@ -105,7 +124,7 @@ class Tpdo(Pdo):
     def poll(self) -> None:
         """Send an event-driven PDO if there is reason to and time has come."""
         payload = self._payload()
-        now_ns = self._clock.now_ns
+        now_ns = self._state.now_ns
         timer_due = self._event_ns and now_ns >= self._event_due_ns
         if (payload != self._sent or timer_due) and now_ns >= self._inhibited_until_ns:
             self._event_due_ns = now_ns + self._event_ns

@@ -3,6 +3,10 @@
 from collections.abc import Callable
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
+from canwall.simdrive.mechanics.motion import RecordedMotion
 from canwall.simdrive.profile.power_drive_system import Motion
 
 
@@ -28,10 +32,18 @@ class FaultyEncoder:
     def __init__(self, motion: Motion) -> None:
         """Read truly at first."""
         self._motion = motion
+        self._recorded = motion if isinstance(motion, RecordedMotion) else None
         self.advance = motion.advance
         self.torque_nm = motion.torque_nm
         self._offset = 0
         self.release()
+
+    @property
+    def record(self) -> NDArray[np.void] | None:
+        """Record of the motion (`RecordedMotion`); None while it is not read truly."""
+        motion = self._motion
+        true = self.counts == motion.counts and self.speed_counts_per_s == motion.speed_counts_per_s
+        return self._recorded.record if self._recorded and true else None
 
     def jump(self, increments: int) -> None:
         """Read so many increments more from now on."""

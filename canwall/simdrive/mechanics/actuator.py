@@ -20,7 +20,7 @@ class Actuator:
             delay_periods: from a demand to its effect, >= 0 and not necessarily whole.
         """
         self.delayed = delay_periods > 0.0
-        """Whether there is a delay."""
+        """True if there is a delay."""
         self._motion = motion
         self._period_s = period_s
         self._delay = delay_periods
@@ -33,18 +33,20 @@ class Actuator:
     def follow(self, part: float) -> None:
         """Let a part of the torque act: 1, or another in a drive whose torque does not follow."""
         self._part = part
-        self.direct = not self.delayed and part == 1.0 and self._motion.torque_nm() is None
-        """Whether the torque that acts is the one that is demanded."""
+        self.steady = not self.delayed and part == 1.0
+        """True if the motion is under the torque that is demanded."""
+        self.direct = self.steady and self._motion.torque_nm() is None
+        """True if that is also the torque that the current loop delivers."""
 
     def torque_nm(self, demand_nm: float) -> float:
-        """Torque that acts now, in N·m, where ``demand_nm`` is demanded."""
+        """Return the torque that acts now, in N·m, where ``demand_nm`` is demanded."""
         delivered = self._motion.torque_nm()
         if delivered is not None:
             return delivered
         return self._part * (self._acting_nm if self.delayed else demand_nm)
 
     def cut(self) -> None:
-        """The power stage is off: what is under way does not come any more."""
+        """Drop what is under way: the power stage is off."""
         self._coming.clear()
         self._demanded_nm = self._acting_nm = 0.0
 

@@ -1,13 +1,93 @@
 """Motor, encoder and the hand on the handle: what the simulated drive moves and measures."""
 
 import math
+from typing import Protocol, runtime_checkable
 
+import numpy as np
+from numpy.typing import NDArray
+
+from canwall.bus.raw_socket import elements
+from canwall.compiled import Record, compiled, fields
 from canwall.config import Simulation
 from canwall.simdrive.mechanics.hand import hand_force
-from canwall.simdrive.mechanics.servo import encoder_counts, make_servo, move_servo
+from canwall.simdrive.mechanics.servo import SERVO, encoder_counts, make_servo, move_servo
 
 _REACHED = 1.0 - 1e-9
 """Share of a period after which it is over: its parts may miss the whole by a rounding."""
+
+_PIECE = 4096
+"""Periods of the hand's script that are laid out at a time."""
+
+#: The servo; force of the hand on it, push + slope·t in each period of a piece of its script
+#: [N·m, N·m/s]; which period this is, and how much of it is over [s]; what the encoder shows.
+MOTION = np.dtype(
+    [
+        ("servo", SERVO, (1,)),
+        ("push", "f8", (_PIECE,)),
+        ("slope", "f8", (_PIECE,)),
+        ("first", "i8"),  # period with which the piece begins
+        ("elapsed", "i8"),
+        ("share", "f8"),
+        ("period", "f8"),
+        ("smoothing", "f8"),
+        ("counts", "i8"),
+        ("counts_before", "i8"),
+        ("counts_per_s", "f8"),
+    ],
+    align=True,
+)
+
+
+@compiled
+def has_script(motions: NDArray[np.void]) -> bool:
+    """True if the piece of the script has the present period."""
+    motion: Record = motions[0]
+    return motion.elapsed - motion.first < _PIECE
+
+
+@compiled
+def advance_motion(motions: NDArray[np.void], torque: float, duration: float) -> float:
+    """Move on under a torque that is demanded meanwhile [N·m], for `duration` [s].
+
+    motions has dtype MOTION and shape (1,). Returns the time that is left where the piece of the
+    script ends, else 0. The velocity is the difference of the encoder over a period, through a
+    low-pass filter of first order.
+    """
+    motion: Record = motions[0]
+    while duration > 0.0:
+        if not has_script(motions):
+            return duration
+        rest = motion.period - motion.share
+        # What is over to the last bits is over: no sliver of a period is left to follow.
+        over = duration >= rest * _REACHED
+        moved = min(duration, rest) if over else duration
+        k = motion.elapsed - motion.first
+        slope = motion.slope[k]
+        push = motion.push[k] + slope * motion.share if motion.share > 0.0 else motion.push[k]
+        servos = elements(motion.servo.ctypes.data, 1, SERVO)
+        motion.counts = move_servo(servos, torque, push, slope, moved)
+        if not over:
+            motion.share += moved
+            break
+        duration -= rest
+        motion.share = 0.0
+        motion.elapsed += 1
+        quotient = (motion.counts - motion.counts_before) / motion.period
+        motion.counts_before = motion.counts
+        motion.counts_per_s += motion.smoothing * (quotient - motion.counts_per_s)
+        if duration < motion.period * (1.0 - _REACHED):
+            break
+    return 0.0
+
+
+@runtime_checkable
+class RecordedMotion(Protocol):
+    """A motion that compiled code can move on."""
+
+    @property
+    def record(self) -> NDArray[np.void] | None:
+        """All there is to know of it, shape (1,), dtype MOTION; None: it is not all there is."""
+        ...
 
 
 class ServoMotion:
@@ -18,91 +98,66 @@ class ServoMotion:
     however a period is divided, the hand is at the same place at its end.
     """
 
-    _PIECE = 4096
-
     def __init__(self, simulation: Simulation, period_s: float, counts_per_rev: float) -> None:
-        self._simulation = simulation
+        self._hand = simulation.hand
         self._period_s = period_s
-        self._servo = make_servo(simulation, counts_per_rev)
-        self._record = self._servo[0]
         self._lags = simulation.current_bandwidth_hz > 0.0
+        self._motion = np.zeros(1, MOTION)
+        self._motion["servo"][0] = make_servo(simulation, counts_per_rev)
+        self._fields: Record = fields(self._motion)
+        self._servo: Record = self._fields.servo[0]
         filtered = simulation.velocity_filter_hz
-        self._smoothing = -math.expm1(-2.0 * math.pi * filtered * period_s) if filtered else 1.0
-        self._elapsed = 0
-        self._share_s = 0.0
-        self._counts = self._counts_before = int(encoder_counts(self._servo))
-        self._speed_counts_per_s = 0.0
+        smoothing = -math.expm1(-2.0 * math.pi * filtered * period_s) if filtered else 1.0
+        self._fields.period, self._fields.smoothing = period_s, smoothing
+        counts = int(encoder_counts(self._motion["servo"][0]))
+        self._fields.counts = self._fields.counts_before = counts
         self._lay_out()
 
     def _lay_out(self) -> None:
-        """Lay out the next piece; what is over is forgotten, however long the drive lives."""
-        self._first = self._elapsed
-        hand = self._simulation.hand
-        constant, slope = hand_force(hand, self._period_s, self._PIECE, self._first)
-        self._script = constant, slope
-        self._constant, self._slope = constant.tolist(), slope.tolist()
+        """Lay out the next piece; what is over is dropped, however long the drive lives."""
+        first = self._fields.first = self._fields.elapsed
+        script = hand_force(self._hand, self._period_s, _PIECE, first)
+        self._motion["push"][0], self._motion["slope"][0] = script
+
+    @property
+    def record(self) -> NDArray[np.void]:
+        """All there is to know of it: shape (1,), dtype MOTION."""
+        return self._motion
 
     @property
     def position_rad(self) -> float:
-        """Where the handle is."""
-        return float(self._record["y"])
+        """Position of the handle."""
+        return float(self._servo.y)
 
     @property
     def speed_rad_s(self) -> float:
-        """How fast the handle moves."""
-        return float(self._record["v"])
+        """Velocity of the handle."""
+        return float(self._servo.v)
 
     @property
     def touching(self) -> bool:
-        """Whether the hand is at the handle."""
-        return bool(self._record["touching"])
+        """True while the hand is at the handle."""
+        return bool(self._servo.touching)
 
     def counts(self) -> int:
-        """Encoder position [increments], the nearest one."""
-        return self._counts
+        """Return the encoder position [increments], the nearest one."""
+        return int(self._fields.counts)
 
     def speed_counts_per_s(self) -> float:
-        """Velocity in increments per second, as the drive computes it.
+        """Return the velocity as the drive computes it [increments/s].
 
         The difference of the encoder over the last SYNC period, through a low-pass filter of
         first order (`velocity_filter_hz`).
         """
-        return self._speed_counts_per_s
+        return float(self._fields.counts_per_s)
 
     def torque_nm(self) -> float | None:
-        """Torque that the current loop delivers now [N·m]; None where it follows at once."""
-        return float(self._record["torque"]) if self._lags else None
+        """Return the torque that the current loop delivers now; None where it follows at once."""
+        return float(self._servo.torque) if self._lags else None
 
     def advance(self, torque_nm: float, duration_s: float) -> None:
         """Move on by any time under a torque that is demanded meanwhile."""
-        left_s = duration_s
+        left_s = advance_motion(self._motion, float(torque_nm), float(duration_s))
         while left_s > 0.0:
-            rest_s = self._period_s - self._share_s
-            # What is over to the last bits is over: no sliver of a period is left to follow.
-            if left_s < rest_s * _REACHED:
-                self._move(torque_nm, left_s)
-                self._share_s += left_s
-                return
-            self._move(torque_nm, min(left_s, rest_s))
-            left_s -= rest_s
-            self._share_s = 0.0
-            self._elapsed += 1
-            self._measure_speed()
-            if left_s < self._period_s * (1.0 - _REACHED):
-                return
-
-    def _move(self, torque_nm: float, duration_s: float) -> None:
-        """Move on within a period of the script."""
-        if self._elapsed - self._first >= self._PIECE:
             self._lay_out()
-        slope = self._slope[self._elapsed - self._first]
-        push = self._constant[self._elapsed - self._first]
-        if self._share_s:
-            push += slope * self._share_s
-        self._counts = move_servo(self._servo, torque_nm, push, slope, duration_s)
-
-    def _measure_speed(self) -> None:
-        counts = self._counts
-        quotient = (counts - self._counts_before) / self._period_s
-        self._counts_before = counts
-        self._speed_counts_per_s += self._smoothing * (quotient - self._speed_counts_per_s)
+            left_s = advance_motion(self._motion, float(torque_nm), left_s)

@@ -3,10 +3,15 @@
 import math
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
+from canwall.compiled import Record, compiled
 from canwall.simdrive.communication.abort import AbortCode, AccessError
 from canwall.simdrive.communication.dictionary import Dictionary
 from canwall.simdrive.profile.hardware import Hardware
 from canwall.simdrive.profile.position_unit import PositionUnit
+from canwall.simdrive.state import POSITION, VELOCITY, DriveState, signed
 
 _INT32 = 1 << 31
 
@@ -20,8 +25,23 @@ _INCREMENTS = 0xB5
 _TIMES_S = {0x03: 1.0, 0x47: 60.0}
 
 
+@compiled
+def latch(drives: NDArray[np.void], counts: int, counts_per_s: float) -> None:
+    """Sample position and velocity: 0x6064 and 0x606C, in the units and directions of the bus."""
+    drive: Record = drives[0]
+    drive.counts = counts
+    position = drive.position_sign * (counts + drive.position_shift)
+    if drive.position_scale != 1.0:
+        scaled = np.floor(position * drive.position_scale + 0.5)
+        # Whatever the scale, the bus has the low 32 bits.
+        position = int(np.fmod(scaled, 2.0 * _INT32))
+    drive.values[POSITION] = signed(position, 32)
+    velocity = np.rint(counts_per_s * drive.velocity_scale)
+    drive.values[VELOCITY] = int(max(-float(_INT32), min(_INT32 - 1.0, velocity)))
+
+
 class Motion(Protocol):
-    """What motor, encoder and hand present to the drive."""
+    """Motor, encoder and hand, as the drive sees them."""
 
     def counts(self) -> int:
         """Return the encoder position in increments; the drive shows its low 32 bits."""
@@ -43,7 +63,9 @@ class Motion(Protocol):
 class Feedback:
     """Latches the measured values into 0x6064 and 0x606C."""
 
-    def __init__(self, dictionary: Dictionary, hardware: Hardware, motion: Motion) -> None:
+    def __init__(
+        self, dictionary: Dictionary, state: DriveState, hardware: Hardware, motion: Motion
+    ) -> None:
         """Serve 0x6064, 0x606C, 0x607E, 0x60A9 and the factor group of the dictionary.
 
         Raises:
@@ -52,18 +74,15 @@ class Feedback:
         """
         self._motion = motion
         self._counts_per_rad = hardware.counts_per_rad
-        self._position = dictionary.number(0x6064, absent=0)
-        self._velocity = dictionary.number(0x606C, absent=0)
+        self._record, self._state = state.record, state.fields
+        for index in (0x6064, 0x606C):
+            dictionary.number(index, absent=0)
         self._polarity = dictionary.number(0x607E, absent=0)
         self._unit = dictionary.number(0x60A9, absent=0)
         self._unit.check = self._check_unit
-        self._position_unit = PositionUnit(dictionary)
+        self._position_unit = PositionUnit(dictionary, state)
         self._polarity.react = self._unit.react = lambda _: self._settle()
-        self._shift = 0
-        self.counts = 0
-        """Encoder position at the last sample, in increments."""
-        self.torque_sign = 1
-        """-1 where the bus counts torque the other way round than the motor."""
+        self._state.position_shift = self._state.counts = 0
         self.rad_s_per_unit = 0.0
         """One unit of velocity at the shaft, in rad/s; accelerations are in this per second."""
         if self._rad_s(self._unit.value) is None:
@@ -71,9 +90,14 @@ class Feedback:
             raise dictionary.error(0x60A9, 0, what)
         self._settle()
 
+    @property
+    def counts(self) -> int:
+        """Encoder position at the last sample, in increments."""
+        return int(self._state.counts)
+
     def reset(self) -> None:
-        """Forget the homing, and take the objects as they stand."""
-        self._shift = 0
+        """Drop the homing, and take the objects as they stand."""
+        self._state.position_shift = 0
         self._position_unit.refresh()
         self._settle()
         self.sample()
@@ -81,7 +105,7 @@ class Feedback:
     def home(self, position: int) -> None:
         """Let the present position be ``position`` (in the units of 0x6064)."""
         counts = round(position / self._position_unit.per_increment)
-        self._shift = self._position_sign * counts - self._motion.counts()
+        self._state.position_shift = self._state.position_sign * counts - self._motion.counts()
         self.sample()
 
     def speed_rad_s(self) -> float:
@@ -90,27 +114,19 @@ class Feedback:
 
     def sample(self) -> None:
         """Latch position and velocity."""
-        self.counts = counts = self._motion.counts()
-        position = self._position_sign * (counts + self._shift)
-        scale = self._position_unit.per_increment
-        if scale != 1.0:
-            position = math.floor(position * scale + 0.5)
-        self._position.value = (position + _INT32) % (2 * _INT32) - _INT32
-        speed = round(self._motion.speed_counts_per_s() * self._units_per_count)
-        self._velocity.value = max(-_INT32, min(_INT32 - 1, speed))
+        latch(self._record, self._motion.counts(), float(self._motion.speed_counts_per_s()))
 
     def _settle(self) -> None:
         """Follow polarity and units."""
         polarity = self._polarity.value
-        self._position_sign = -1 if polarity & POSITION_POLARITY else 1
-        self.torque_sign = -1 if polarity & TORQUE_POLARITY else 1
+        state = self._state
+        state.position_sign = -1 if polarity & POSITION_POLARITY else 1
+        state.torque_sign = -1 if polarity & TORQUE_POLARITY else 1
         self.rad_s_per_unit = self._rad_s(self._unit.value) or 1.0 / self._counts_per_rad
         units_per_count = 1.0 / (self.rad_s_per_unit * self._counts_per_rad)
         if abs(units_per_count - 1.0) < 1e-12:
             units_per_count = 1.0
-        self._units_per_count = (
-            -units_per_count if polarity & VELOCITY_POLARITY else units_per_count
-        )
+        state.velocity_scale = -units_per_count if polarity & VELOCITY_POLARITY else units_per_count
 
     def _rad_s(self, si_unit: int) -> float | None:
         """Return a unit of velocity in rad/s, None if it is not known; 0: increments per second."""

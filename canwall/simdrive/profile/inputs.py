@@ -2,6 +2,7 @@
 
 from canwall.simdrive.communication.dictionary import Dictionary
 from canwall.simdrive.profile.hardware import Hardware
+from canwall.simdrive.state import DriveState
 
 NEGATIVE_LIMIT, POSITIVE_LIMIT, HOME, INTERLOCK = (1 << bit for bit in range(4))
 
@@ -12,7 +13,7 @@ class DigitalInputs:
     A limit switch stays closed beyond the position where it closes.
     """
 
-    def __init__(self, dictionary: Dictionary, hardware: Hardware) -> None:
+    def __init__(self, dictionary: Dictionary, state: DriveState, hardware: Hardware) -> None:
         """Serve 0x60FD of the dictionary.
 
         Raises:
@@ -26,18 +27,24 @@ class DigitalInputs:
         self.wired = bool(
             hardware.home or (self._negative_limit, self._positive_limit) != (None, None)
         )
-        """Whether the position closes a switch anywhere."""
-        self.closed = 0
+        """True if the position closes a switch anywhere."""
+        self._state = state.fields
+        self._state.inputs = 0
+
+    @property
+    def closed(self) -> int:
         """The bits of 0x60FD."""
+        closed: int = self._state.inputs
+        return closed
 
     @property
     def at_limit(self) -> bool:
-        """Whether a limit switch is closed."""
+        """True while a limit switch is closed."""
         return bool(self.closed & (NEGATIVE_LIMIT | POSITIVE_LIMIT))
 
     @property
     def torque_is_off(self) -> bool:
-        """Whether STO is active."""
+        """True while STO is active."""
         return bool(self._interlock)
 
     def sto(self, active: bool) -> None:
@@ -46,7 +53,7 @@ class DigitalInputs:
         self._show(self.closed & ~INTERLOCK | self._interlock)
 
     def sample(self, counts: int) -> bool:
-        """See which switches are closed at an encoder position; return whether any has changed."""
+        """Set the switches that an encoder position closes; return True if any has changed."""
         closed = self._interlock
         if self._negative_limit is not None and counts <= self._negative_limit:
             closed |= NEGATIVE_LIMIT
@@ -59,4 +66,4 @@ class DigitalInputs:
         return changed
 
     def _show(self, closed: int) -> None:
-        self.closed = self._object.value = closed
+        self._state.inputs = self._object.value = closed

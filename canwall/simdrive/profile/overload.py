@@ -1,42 +1,69 @@
-"""I²t: how long the motor may have more than its rated torque."""
+"""I²t: how long the motor may have more than its rated torque.
+
+A budget of the square of the torque (as of the current) above the rated one, over time. Once it is
+used up the torque falls back to the rated one; less than that fills it again. Torques are in per
+mille of the rated one.
+"""
 
 import math
 
-_RATED_SQUARED = 1000.0**2
+import numpy as np
+from numpy.typing import NDArray
+
+from canwall.compiled import Record, compiled
+from canwall.simdrive.state import DriveState
+
+_RATED = 1000
+_WARNING = 0.8
+"""Part of the budget whose use is a warning (statusword bit 7)."""
+
+
+@compiled
+def used_after(drives: NDArray[np.void], passed: float) -> float:
+    """Return what is used of the budget once the torque has held for `passed` seconds more."""
+    drive: Record = drives[0]
+    return max(0.0, drive.used + (drive.held**2 - _RATED**2) * passed)
+
+
+@compiled
+def covered(drives: NDArray[np.void], used: float) -> int:
+    """Return the largest torque that the rest of the budget covers for a period."""
+    drive: Record = drives[0]
+    left = max(0.0, (drive.budget - used) / drive.period)
+    return math.floor(min(drive.peak, math.sqrt(_RATED**2 + left) + 1e-9))
+
+
+@compiled
+def warns(drives: NDArray[np.void], used: float) -> bool:
+    """True if so much of the budget is used that the drive warns of it."""
+    drive: Record = drives[0]
+    return used > _WARNING * drive.budget
 
 
 class Overload:
-    """A budget of the square of the torque (as of the current) above the rated one, over time.
+    """The budget of a motor."""
 
-    At the peak torque it lasts for ``overload_s``. Once it is used up the torque falls back to
-    the rated one; less than that fills it again. Torques are in per mille of the rated one.
-    """
-
-    def __init__(self, peak: float, overload_s: float) -> None:
-        self.peak = peak
-        self._budget = max(0.0, peak**2 - _RATED_SQUARED) * overload_s
-        self._used = 0.0
-
-    @property
-    def idle(self) -> bool:
-        """Whether nothing of the budget is used."""
-        return self._used == 0.0
+    def __init__(self, state: DriveState, peak: float, overload_s: float) -> None:
+        """Begin cold; at the peak torque the budget lasts for ``overload_s``."""
+        self._record, self._state = state.record, state.fields
+        self._state.peak = peak
+        self._state.budget = max(0.0, peak**2 - _RATED**2) * overload_s
+        self.reset()
 
     @property
     def warning(self) -> bool:
-        """Whether four fifths of it are used up."""
-        return self._used > 0.8 * self._budget
+        """True if four fifths of it are used up."""
+        return warns(self._record, self._state.used)
+
+    @property
+    def limit(self) -> int:
+        """The largest torque that it covers for a period."""
+        return covered(self._record, self._state.used)
 
     def reset(self) -> None:
-        """The motor is cold."""
-        self._used = 0.0
+        """Begin cold."""
+        self._state.used = 0.0
 
-    def limit(self, duration_s: float) -> int:
-        """Return the largest torque that the budget covers for ``duration_s`` seconds."""
-        left = (self._budget - self._used) / duration_s
-        return math.floor(min(self.peak, math.sqrt(_RATED_SQUARED + max(0.0, left)) + 1e-9))
-
-    def load(self, torque: int, duration_s: float) -> None:
-        """Reckon with a torque that lasts for ``duration_s`` seconds."""
-        used = self._used + (torque**2 - _RATED_SQUARED) * duration_s
-        self._used = max(0.0, used)
+    def pass_time(self, passed_s: float) -> None:
+        """Account for the torque that has held for ``passed_s`` seconds."""
+        self._state.used = used_after(self._record, passed_s)

@@ -7,6 +7,7 @@ feed constant is 0x6092, or follows from a unit of angle in 0x60A8.
 import math
 
 from canwall.simdrive.communication.dictionary import Dictionary, Entry
+from canwall.simdrive.state import DriveState
 
 #: Codes of 0x60A8 in bits 16 to 23 (CiA 303-2): units per revolution. All others: increments.
 _ANGLES = {0x10: 2.0 * math.pi, 0x41: 360.0, 0xB4: 1.0}
@@ -15,9 +16,10 @@ _RESOLUTION, _GEAR, _FEED = 0x608F, 0x6091, 0x6092
 
 
 def quotient(dictionary: Dictionary, index: int) -> float:
-    """Numerator over denominator of a pair of entries as they stand; 1 where there is none.
+    """Return numerator over denominator of a pair of entries; 1 where there is none.
 
-    Raises DictionaryError for what is no scale.
+    Raises:
+        DictionaryError: it is no scale.
     """
     numerator, denominator = _pair(dictionary, index)
     if numerator.value <= 0 or denominator.value <= 0:
@@ -35,9 +37,10 @@ def _pair(dictionary: Dictionary, index: int) -> tuple[Entry, Entry]:
 class PositionUnit:
     """Serves the factor group. A drive that nobody told its encoder (1/1) counts increments."""
 
-    def __init__(self, dictionary: Dictionary) -> None:
-        """Args: dictionary: has the entries."""
-        self.per_increment = 1.0
+    def __init__(self, dictionary: Dictionary, state: DriveState) -> None:
+        """Serve the objects of the dictionary; begin with increments."""
+        self._state = state.fields
+        self._state.position_scale = 1.0
         self._resolution, self._gear, self._feed = (
             _pair(dictionary, index) for index in (_RESOLUTION, _GEAR, _FEED)
         )
@@ -46,9 +49,14 @@ class PositionUnit:
             entry.react = self._react
         self._si_unit.react = self._react
 
+    @property
+    def per_increment(self) -> float:
+        """Units per increment."""
+        return float(self._state.position_scale)
+
     def refresh(self) -> None:
         """Take the entries as they stand."""
-        self.per_increment = 1.0
+        self._state.position_scale = 1.0
         resolution = _ratio(self._resolution) * _ratio(self._gear)
         if _ratio(self._resolution) == 1.0:
             return
@@ -56,9 +64,9 @@ class PositionUnit:
         angle = _ANGLES.get(unit >> 16 & 0xFF)
         if angle is not None:
             exponent = int.from_bytes([unit >> 24 & 0xFF], signed=True)
-            self.per_increment = angle / 10.0**exponent / resolution
+            self._state.position_scale = angle / 10.0**exponent / resolution
         elif _ratio(self._feed) != 1.0:
-            self.per_increment = _ratio(self._feed) / resolution
+            self._state.position_scale = _ratio(self._feed) / resolution
 
     def _react(self, _: int) -> None:
         self.refresh()

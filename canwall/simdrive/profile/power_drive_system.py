@@ -17,6 +17,7 @@ from canwall.simdrive.profile.option_codes import OptionCode, Ramp
 from canwall.simdrive.profile.slow_down import STANDSTILL_RAD_S, SlowDown
 from canwall.simdrive.profile.state_machine import Command, PdsState, StateMachine
 from canwall.simdrive.profile.torque import TorquePath
+from canwall.simdrive.state import DriveState
 
 __all__ = ["Motion", "PowerDriveSystem"]
 
@@ -44,11 +45,12 @@ _FASTEST_SLOPE = 1 << 31
 
 
 class PowerDriveSystem:
-    """PdsState machine and mode of operation of the one axis, and what they make of the parts."""
+    """State machine and mode of operation of the one axis, and what they make of the parts."""
 
     def __init__(
         self,
         dictionary: Dictionary,
+        state: DriveState,
         motion: Motion,
         emcy: EmergencyProducer,
         hardware: Hardware,
@@ -58,6 +60,7 @@ class PowerDriveSystem:
 
         Args:
             dictionary: of this drive.
+            state: of this drive.
             motion: motor, encoder and hand.
             emcy: tells of faults.
             hardware: what the dictionary does not say.
@@ -68,9 +71,9 @@ class PowerDriveSystem:
         """
         self._emcy = emcy
         self._hardware = hardware
-        self._feedback = Feedback(dictionary, hardware, motion)
-        self._inputs = DigitalInputs(dictionary, hardware)
-        self._torque = TorquePath(dictionary, hardware, self._feedback, self._inputs, period_s)
+        self._feedback = Feedback(dictionary, state, hardware, motion)
+        self._inputs = DigitalInputs(dictionary, state, hardware)
+        self._torque = TorquePath(dictionary, state, hardware)
         self._slow_down = SlowDown(dictionary, hardware, self._feedback, period_s)
         self._homing = Homing(dictionary, self._feedback)
         number = dictionary.number
@@ -171,6 +174,11 @@ class PowerDriveSystem:
     def slowing_down(self) -> bool:
         """Whether the drive brakes by itself, and has not come to rest."""
         return self._ramp is not None and not self._slow_down.done
+
+    @property
+    def steady(self) -> bool:
+        """True if it follows the target torque, and no switch is passed on the way."""
+        return self._follows_target and not self._inputs.wired and not self._inputs.closed
 
     @property
     def motor_free(self) -> bool:

@@ -1,16 +1,74 @@
 """From the torque that is wanted to the one that the motor gives: limits, units, display."""
 
+import numpy as np
+from numpy.typing import NDArray
+
+from canwall.compiled import Record, compiled
 from canwall.simdrive.communication.dictionary import Dictionary
-from canwall.simdrive.profile.feedback import Feedback
 from canwall.simdrive.profile.hardware import Hardware
-from canwall.simdrive.profile.inputs import NEGATIVE_LIMIT, POSITIVE_LIMIT, DigitalInputs
-from canwall.simdrive.profile.overload import Overload
+from canwall.simdrive.profile.inputs import NEGATIVE_LIMIT, POSITIVE_LIMIT
+from canwall.simdrive.profile.overload import Overload, covered
+from canwall.simdrive.state import (
+    CURRENT,
+    MAX_CURRENT,
+    MAX_TORQUE,
+    RATED_TORQUE,
+    TORQUE,
+    TORQUE_DEMAND,
+    DriveState,
+)
+from canwall.simdrive.state import NEGATIVE_LIMIT as NEGATIVE_TORQUE_LIMIT
+from canwall.simdrive.state import POSITIVE_LIMIT as POSITIVE_TORQUE_LIMIT
 
 _NO_LIMIT = 1 << 31
 _PER_MILLE_MILLI = 1e-6
 """Per mille of a rated torque in mN m, to N m."""
+_RATED = 1000
 _PEAK = 3000.0
 """Peak torque in per mille of the rated one, where the hardware does not say."""
+
+
+@compiled
+def nm_per_mille(drives: NDArray[np.void]) -> float:
+    """Return one unit of torque on the bus, at the shaft and in the motor's direction [N·m]."""
+    drive: Record = drives[0]
+    scale = drive.values[RATED_TORQUE] * _PER_MILLE_MILLI * drive.gear_ratio
+    return scale * drive.torque_sign
+
+
+@compiled
+def demanded_nm(drives: NDArray[np.void]) -> float:
+    """Return the torque demanded of the motor, at the shaft and in its direction [N·m]."""
+    return drives[0].values[TORQUE_DEMAND] * nm_per_mille(drives)
+
+
+@compiled
+def limited(drives: NDArray[np.void], used: float, wanted: int) -> int:
+    """Return the torque wanted within all limits, `used` of the I²t budget being used."""
+    drive: Record = drives[0]
+    values = drive.values
+    limit = min(values[MAX_TORQUE], values[MAX_CURRENT], int(drive.peak))
+    highest = min(limit, values[POSITIVE_TORQUE_LIMIT])
+    lowest = -min(limit, values[NEGATIVE_TORQUE_LIMIT])
+    # A limit switch lets the axis go away from it only.
+    closed = drive.inputs
+    if closed & (NEGATIVE_LIMIT if drive.torque_sign > 0 else POSITIVE_LIMIT):
+        lowest = max(lowest, 0)
+    if closed & (POSITIVE_LIMIT if drive.torque_sign > 0 else NEGATIVE_LIMIT):
+        highest = min(highest, 0)
+    torque = max(lowest, min(highest, wanted))
+    if not -_RATED <= torque <= _RATED:
+        most = covered(drives, used)
+        torque = max(-most, min(most, torque))
+    return torque
+
+
+@compiled
+def show_torque(drives: NDArray[np.void], torque_nm: float) -> None:
+    """Show a torque that is not the one demanded, in 0x6077 and 0x6078."""
+    values = drives[0].values
+    scale = nm_per_mille(drives)
+    values[TORQUE] = values[CURRENT] = int(np.rint(torque_nm / scale)) if scale != 0.0 else 0
 
 
 class TorquePath:
@@ -20,104 +78,73 @@ class TorquePath:
     so 0x6073 and 0x6078 (per mille of 0x6075) are the same numbers.
     """
 
-    def __init__(
-        self,
-        dictionary: Dictionary,
-        hardware: Hardware,
-        feedback: Feedback,
-        inputs: DigitalInputs,
-        period_s: float,
-    ) -> None:
+    def __init__(self, dictionary: Dictionary, state: DriveState, hardware: Hardware) -> None:
         """Serve 0x6072 to 0x6074, 0x6076 to 0x6078, 0x60E0 and 0x60E1 of the dictionary.
 
         Raises:
             DictionaryError: one of them is not an integer.
         """
-        self._feedback = feedback
-        self._inputs = inputs
-        self._gear_ratio = hardware.gear_ratio
+        self._record, self._state = state.record, state.fields
         number = dictionary.number
         self._max_torque = number(0x6072, absent=_NO_LIMIT)
         self._max_current = number(0x6073, absent=_NO_LIMIT)
-        self._positive_limit = number(0x60E0, absent=_NO_LIMIT)
-        self._negative_limit = number(0x60E1, absent=_NO_LIMIT)
-        self._rated = number(0x6076, absent=0)
+        for index in (0x60E0, 0x60E1):
+            number(index, absent=_NO_LIMIT)
         self._demand = number(0x6074, absent=0)
         self._actual = number(0x6077, absent=0)
         self._current = number(0x6078, absent=0)
-        rated_nm = self._rated.value * 1e-3
+        rated_nm = number(0x6076, absent=0).value * 1e-3
         peak = hardware.peak_torque_nm
         per_mille = 1e3 * peak / rated_nm if peak and rated_nm else _PEAK
-        self.overload = Overload(per_mille, hardware.overload_s)
-        self._peak = int(per_mille)
-        self._period_s = period_s
-        self._held = 0
-        self.limited = False
-        """Whether the motor has less than was wanted."""
+        self.overload = Overload(state, per_mille, hardware.overload_s)
+        self._state.gear_ratio = hardware.gear_ratio
+        self._state.held = 0
+        self._state.limited = False
+
+    @property
+    def limited(self) -> bool:
+        """True if the motor has less than was wanted."""
+        return bool(self._state.limited)
 
     @property
     def torque_nm(self) -> float:
         """Torque demanded of the motor, at the shaft and in the motor's direction, in N m."""
-        torque: float = self._demand.value * self._nm_per_mille
-        return torque
+        return demanded_nm(self._record)
 
     @property
     def largest_nm(self) -> float:
         """Limit of both directions in the coming period, at the shaft, in N m."""
-        limit = min(self._max_torque.value, self._max_current.value)
-        largest: float = min(limit, self.overload.limit(self._period_s)) * abs(self._nm_per_mille)
+        limit = min(self._max_torque.value, self._max_current.value, self.overload.limit)
+        largest: float = limit * abs(nm_per_mille(self._record))
         return largest
-
-    @property
-    def _nm_per_mille(self) -> float:
-        """Torque at the shaft, in N m and in the motor's direction, per unit of the bus."""
-        scale: float = self._rated.value * _PER_MILLE_MILLI * self._gear_ratio
-        return scale * self._feedback.torque_sign
 
     def off(self) -> None:
         """Take the torque away at once."""
         self._show(0)
-        self.limited = False
+        self._state.limited = False
 
     def pass_time(self, passed_s: float) -> None:
-        """Reckon with the torque that has held for ``passed_s`` seconds (I²t)."""
-        if not (-1000 <= self._held <= 1000 and self.overload.idle):
-            self.overload.load(self._held, passed_s)
-        self._held = self._demand.value
+        """Account for the torque that has held for ``passed_s`` seconds (I²t)."""
+        self.overload.pass_time(passed_s)
+        self._state.held = self._demand.value
 
     def give(self, wanted: int) -> None:
         """Demand the torque wanted from now on, within all limits."""
-        limit = min(self._max_torque.value, self._max_current.value, self._peak)
-        highest = min(limit, self._positive_limit.value)
-        lowest = -min(limit, self._negative_limit.value)
-        if self._inputs.at_limit:
-            lowest, highest = self._away_from_the_switch(lowest, highest)
-        actual = max(lowest, min(highest, wanted))
-        if not -1000 <= actual <= 1000:
-            covered = self.overload.limit(self._period_s)
-            actual = max(-covered, min(covered, actual))
-        self._held = actual
+        actual = limited(self._record, self._state.used, wanted)
+        self._state.held = actual
         self._show(actual)
-        self.limited = actual != wanted
+        self._state.limited = actual != wanted
 
     def brake(self, torque_nm: float) -> None:
         """Demand a torque that is within ``largest_nm``; no other limit keeps a brake away."""
-        scale = self._nm_per_mille
-        self._held = round(torque_nm / scale) if scale else 0
-        self._show(self._held)
-        self.limited = abs(torque_nm) >= self.largest_nm
+        scale = nm_per_mille(self._record)
+        self._state.held = round(torque_nm / scale) if scale else 0
+        self._show(self._state.held)
+        self._state.limited = abs(torque_nm) >= self.largest_nm
 
     def show_actual(self, torque_nm: float) -> None:
         """Let 0x6077 and 0x6078 show a torque that is not the one demanded."""
-        scale = self._nm_per_mille
-        self._actual.value = self._current.value = round(torque_nm / scale) if scale else 0
-
-    def _away_from_the_switch(self, lowest: int, highest: int) -> tuple[int, int]:
-        closed = self._inputs.closed
-        positive, negative = closed & POSITIVE_LIMIT, closed & NEGATIVE_LIMIT
-        if self._feedback.torque_sign < 0:
-            positive, negative = negative, positive
-        return max(lowest, 0) if negative else lowest, min(highest, 0) if positive else highest
+        show_torque(self._record, torque_nm)
 
     def _show(self, demand: int) -> None:
         self._demand.value = self._actual.value = self._current.value = demand
