@@ -159,10 +159,12 @@ DEADBEAT = "+deadbeat"
 def law(function: Callable[[Any], float]) -> Law:
     """Declare a function of this package as a law; its options are the OPTIONS of its file.
 
-    The law is named as the function, and `<name>_deadbeat` is its variant with deadbeat
-    compensation, `<name>+deadbeat`.
+    The law has the name of the function; a function `<law>_deadbeat` is the variant of a law with
+    deadbeat compensation, `<law>+deadbeat`.
     """
-    name = function.__name__.replace("_deadbeat", DEADBEAT)
+    name = function.__name__
+    if name.endswith("_deadbeat"):
+        name = name.removesuffix("_deadbeat") + DEADBEAT
     return Law(name, function, function.__globals__.get("OPTIONS", {}))
 
 
