@@ -24,8 +24,8 @@ MEMORY = 8
 #: The longest contact, in periods, that a law may plan as a whole.
 HORIZON = 64
 
-#: One wall. Units: rad or m, s, N·m or N and their quotients. A law that has options sees it as
-#: `wall_with`: it reads them by name, from the record `options`.
+#: One wall. Units: rad or m, s, N·m or N and their quotients. A law with options is compiled for
+#: the same record with names to its options (`wall_with`): `wall.options.growth`.
 WALL = np.dtype(
     [
         # The wall to be rendered.
@@ -113,8 +113,8 @@ class Law:
     ) -> None:
         """Declare a law; nothing is compiled yet.
 
-        `cached` keeps the compiled code on disk, for functions of this package only: elsewhere
-        nobody watches for changes of what the function calls (`compiled`).
+        `cached` keeps the compiled code on disk, for functions of this package only: a change of
+        what a function calls is noticed here, not elsewhere (`canwall.compiled`).
         """
         self.name = name
         self.options = options
@@ -159,10 +159,12 @@ DEADBEAT = "+deadbeat"
 def law(function: Callable[[Any], float]) -> Law:
     """Declare a function of this package as a law; its options are the OPTIONS of its file.
 
-    The law is named as the function, and `<name>_deadbeat` is its variant with deadbeat
-    compensation, `<name>+deadbeat`.
+    The law has the name of the function; a function `<law>_deadbeat` is the variant of a law with
+    deadbeat compensation, `<law>+deadbeat`.
     """
-    name = function.__name__.replace("_deadbeat", DEADBEAT)
+    name = function.__name__
+    if name.endswith("_deadbeat"):
+        name = name.removesuffix("_deadbeat") + DEADBEAT
     return Law(name, function, function.__globals__.get("OPTIONS", {}))
 
 

@@ -34,7 +34,7 @@ from canwall.walls import (
     two_step,
     unidirectional_damper,
 )
-from canwall.walls.interface import DEADBEAT, MAX_OPTIONS, WALL, Law, UnknownLawError
+from canwall.walls.interface import DEADBEAT, MAX_OPTIONS, Law, UnknownLawError, wall_with
 
 #: Every law that comes with the project, by name.
 LAWS: dict[str, Law] = {
@@ -135,7 +135,7 @@ def _declared_options(where: str, options: object) -> Mapping[str, float]:
 def _unknown_field(name: str, options: Mapping[str, float]) -> str:
     if name == "options":
         return "reads wall.options, but its file declares no OPTIONS"
-    known = [*(WALL.names or ()), *options]
+    known = [*(wall_with(options).names or ()), *options]
     close = difflib.get_close_matches(name, known, n=1)
     hint = f"; did you mean {close[0]}?" if close else ""
     return f"reads {name}, which is neither a field of the wall nor an option{hint}"
