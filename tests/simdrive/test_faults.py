@@ -425,6 +425,13 @@ def test_what_is_no_fault_is_refused(on_the_bus: BusBenchFactory, fault: dict[st
     assert abort.value.code == 0x08000022
 
 
+def test_number_beyond_the_kinds(on_the_bus: BusBenchFactory) -> None:
+    bench = on_the_bus()
+    with pytest.raises(SdoAbortedError) as abort:
+        bench.write(0x5F00, 1, len(KINDS) + 1, 1)
+    assert abort.value.code == 0x06090031
+
+
 def test_no_kind_is_no_fault(on_the_bus: BusBenchFactory) -> None:
     bench = on_the_bus()
     with pytest.raises(SdoAbortedError):

@@ -55,7 +55,7 @@ class FaultRequest:
         ):
             return
         self._entries = {sub: dictionary[INDEX, sub] for sub in _FORMATS}
-        self._entries[_KIND].allow((0, *_KINDS))
+        self._entries[_KIND].allow((0, *_KINDS)).high = max(_KINDS)
         self._entries[_CAN_ID].allow((*range(0x800), _ANY_CAN_ID))
         self._entries[_DIRECTION].allow(range(len(_DIRECTIONS)))
         self._entries[_PROBABILITY].allow(range(1001))
