@@ -5,7 +5,7 @@ is a `ConfigError` of one line: file, key, what is wrong, what to do.
 """
 
 from canwall.config.drive import Drive
-from canwall.config.fault import AMOUNTS, NUMBERS, ON_FRAMES, Direction, Fault, FaultName
+from canwall.config.fault import Fault
 from canwall.config.hand import Hand, Move, RandomStrikes
 from canwall.config.reading import ConfigError, absolute_law, first_error, load, overridden, shipped
 from canwall.config.settings import (
@@ -23,16 +23,11 @@ from canwall.config.settings import (
 from canwall.config.simulation import Simulation
 
 __all__ = [
-    "AMOUNTS",
-    "NUMBERS",
-    "ON_FRAMES",
     "Bus",
     "ConfigError",
-    "Direction",
     "Drive",
     "Estimator",
     "Fault",
-    "FaultName",
     "Hand",
     "Limits",
     "Mechanics",

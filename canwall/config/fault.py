@@ -1,76 +1,26 @@
-"""`[[simulation.fault]]`: what goes wrong in the simulated drive, and when."""
+"""`[[simulation.fault]]`: a fault of the simulated drive, and when it is present."""
 
-from dataclasses import dataclass
-from typing import Annotated, Literal, Self, TypeAlias, get_args
+from typing import Annotated, Any, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, GetPydanticSchema, model_validator
+from pydantic_core import core_schema
 
 from canwall.config.section import NonNegative, Number, Positive, Section
-
-Direction: TypeAlias = Literal["sent", "received", "both"]
-"""Frames that the drive sends, those that it receives, or both."""
-
-FaultName: TypeAlias = Literal[
-    "lost",
-    "late",
-    "doubled",
-    "corrupted",
-    "wrong_length",
-    "silence",
-    "reboot",
-    "emcy",
-    "fault",
-    "encoder_jump",
-    "encoder_stuck",
-    "torque",
-    "sto",
-    "undervoltage",
-    "bus_off",
-    "babbling",
-]
-"""In the order of their numbers in 0x5F00:01, which begin with 1."""
+from canwall.faults import KINDS, Direction
 
 
-@dataclass(frozen=True)
-class Amount:
-    """What the amount of a fault may be, what it is where none is given, and its unit."""
-
-    usual: int = 0
-    lowest: int = 0
-    highest: int = 0
-    unit: str = ""
-
-
-AMOUNTS: dict[FaultName, Amount] = {
-    "late": Amount(1, 1, 100_000, "SYNC periods"),
-    "doubled": Amount(1, 1, 100, "copies more"),
-    "corrupted": Amount(1, 0, 64, "bits"),
-    "wrong_length": Amount(-1, -8, 8, "bytes more"),
-    "emcy": Amount(0x1000, 1, 0xFFFF, "error code"),
-    "fault": Amount(0x5000, 1, 0xFFFF, "error code"),
-    "encoder_jump": Amount(1000, -(2**31), 2**31 - 1, "increments"),
-    "torque": Amount(0, -1000, 1000, "per mille of the demand"),
-    "babbling": Amount(10, 1, 1000, "frames per SYNC period"),
-}
-"""Kinds that have an amount."""
-
-ON_FRAMES: frozenset[FaultName] = frozenset(
-    ("lost", "late", "doubled", "corrupted", "wrong_length")
-)
-"""Kinds that touch frames: of a CAN-ID, in a direction, with a probability."""
-
-NUMBERS: dict[FaultName, int] = {name: n for n, name in enumerate(get_args(FaultName), start=1)}
-"""Of the kinds, in 0x5F00:01."""
+def _one_of_the_kinds(source: Any, handler: Any) -> core_schema.CoreSchema:
+    return core_schema.literal_schema([*KINDS])
 
 
 class Fault(Section):
-    """One fault: its kind, from when on, for how long, and what it touches.
+    """One fault: its kind, its begin and duration, and what it touches.
 
     Without at_s and at_sync it is there from power-on; without a duration it stays (`reboot`
     is over at once). docs/faults.md has the kinds and their amounts.
     """
 
-    kind: FaultName
+    kind: Annotated[str, GetPydanticSchema(_one_of_the_kinds)]
     at_s: NonNegative | None = None
     at_sync: int | None = Field(None, ge=0)
     duration_s: Positive | None = None
@@ -85,20 +35,14 @@ class Fault(Section):
         for one, other in (("at_s", "at_sync"), ("duration_s", "duration_syncs")):
             if getattr(self, one) is not None and getattr(self, other) is not None:
                 raise ValueError(f"{one} and {other} say the same; keep one of them")
-        unwanted = [] if self.kind in ON_FRAMES else ["direction", "probability"]
-        if self.kind not in ON_FRAMES and self.kind != "babbling":
-            unwanted.append("can_id")
-        if self.kind not in AMOUNTS:
-            unwanted.append("amount")
-        for key in unwanted:
-            if getattr(self, key) is not None:
-                raise ValueError(f"{key}: the kind {self.kind} has none; remove it")
-        amount = AMOUNTS.get(self.kind)
-        if amount and self.amount is not None:
-            low, high = amount.lowest, amount.highest
-            if not low <= self.amount <= high:
-                raise ValueError(
-                    f"amount: has to be {low} to {high} [{amount.unit}] for the kind "
-                    f"{self.kind}, not {self.amount}"
-                )
+        kind = KINDS[self.kind]
+        for key in ("direction", "probability", "can_id", "amount"):
+            if getattr(self, key) is not None and key not in kind.own_keys():
+                raise ValueError(f"{key}: the kind {kind.name} has none; remove it")
+        amount = kind.amount
+        if amount and self.amount is not None and self.amount not in amount:
+            raise ValueError(
+                f"amount: has to be {amount.lowest} to {amount.highest} [{amount.unit}] for the "
+                f"kind {kind.name}, not {self.amount}"
+            )
         return self

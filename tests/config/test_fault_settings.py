@@ -1,12 +1,15 @@
 """`[[simulation.fault]]`: what is a fault, and what a configuration says that is none."""
 
+import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 from commands import config_file
 
-from canwall.config import AMOUNTS, NUMBERS, ConfigError, load
+from canwall.config import ConfigError, load
+from canwall.faults import KINDS, FaultKind
+
+DOCUMENT = Path(__file__).parents[2] / "docs" / "faults.md"
 
 
 def file_with(tmp_path: Path, *faults: str) -> Path:
@@ -62,16 +65,29 @@ def test_what_is_no_fault(tmp_path: Path, fault: str, line: str) -> None:
     assert line in str(error.value)
 
 
-def test_document_has_every_kind_with_its_number_and_default() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "faults.md").read_text(encoding="utf-8")
-    rows: dict[str, Any] = {
-        cells[2].strip(" `"): (int(cells[1]), cells[4].split(":")[0].strip().replace("−", "-"))
-        for cells in (line.split("|") for line in text.splitlines())
-        if len(cells) == 6 and cells[1].strip().isdigit()
-    }
-    assert {kind: number for kind, (number, _) in rows.items()} == NUMBERS
-    for kind, (_, default) in rows.items():
-        if kind in AMOUNTS:
-            assert int(default, 0) == AMOUNTS[kind].usual  # type: ignore[index]
-        else:
-            assert default == ""
+def test_every_kind_has_its_own_name_and_number() -> None:
+    assert [kind.number for kind in KINDS.values()] == list(range(1, len(KINDS) + 1))
+    declared = [kind for kind in FaultKind.__subclasses__() if "canwall." in kind.__module__]
+    assert len(declared) == len(KINDS)
+
+
+def row(kind: type[FaultKind]) -> str:
+    """The kind as the users' document has it."""
+    assert kind.__doc__ is not None
+    amount = ""
+    if kind.amount:
+        usual, lowest, highest = (
+            kind.amount.shown(value).replace("-", "−")
+            for value in (kind.amount.usual, kind.amount.lowest, kind.amount.highest)
+        )
+        amount = f"{usual}: {kind.amount.unit}, {lowest} to {highest}"
+    what = " ".join(kind.__doc__.split())
+    frames = ", ".join(f"`{key}`" for key in kind.frame_keys)
+    cells = [str(kind.number), f"`{kind.name}`", what, frames, amount]
+    return "|".join(["", *(f" {cell} " if cell else " " for cell in cells), ""])
+
+
+def test_document_has_every_kind() -> None:
+    lines = DOCUMENT.read_text(encoding="utf-8").splitlines()
+    found = [line for line in lines if re.match(r"\| \d+ \|", line)]
+    assert found == [row(kind) for kind in KINDS.values()]

@@ -15,8 +15,9 @@ from rig import SDO_REQUEST, SYNC
 import canwall.run.buses
 import canwall.run.running
 from canwall import cli, simdrive
-from canwall.config import NUMBERS, Settings
+from canwall.config import Settings
 from canwall.cycle import exchange as exchange_module
+from canwall.faults import KINDS
 from canwall.record import Phase
 
 CASES = Path(__file__).with_name("fault_cases.txt")
@@ -184,7 +185,7 @@ def test_case(
 
 def test_every_fault_at_every_time() -> None:
     named = {(case.fault.split()[0], case.when) for case in cases()}
-    assert named >= {(kind, when) for kind in NUMBERS for when in ("enabling", "moving", "resting")}
+    assert named >= {(kind, when) for kind in KINDS for when in ("enabling", "moving", "resting")}
 
 
 def table() -> str:

@@ -23,9 +23,10 @@ from simdrive_bench import (
     Bench,
 )
 
-from canwall.config import NUMBERS, Hand, Simulation
 from canwall.config import Drive as DriveSettings
 from canwall.config import Fault as FaultSettings
+from canwall.config import Hand, Simulation
+from canwall.faults import KINDS
 from canwall.simdrive import BusRunner, Frame, make_drive
 
 ERROR_FRAME = 1 << 29
@@ -107,7 +108,7 @@ class BusBench(Bench):
 
     def ask(self, **fault: Any) -> None:
         """Ask for a fault over SDO."""
-        values = {**fault, "kind": NUMBERS[fault["kind"]]}
+        values = {**fault, "kind": KINDS[fault["kind"]].number}
         if "probability" in values:
             values["probability"] = round(1000 * values["probability"])
         if "direction" in values:
@@ -334,6 +335,24 @@ def test_torque_that_does_not_follow(begun: Begin) -> None:
     assert bench.read(0x6074) == 500
 
 
+def test_last_of_overlapping_faults_ends_them(on_the_bus: BusBenchFactory) -> None:
+    bench = on_the_bus(
+        {"kind": "torque", "amount": 200, "at_sync": 4, "duration_syncs": 3},
+        {"kind": "torque", "amount": 300, "at_sync": 5, "duration_syncs": 4},
+    ).start()
+    bench.command(0x0F, 500)
+    assert [bench.cycle()[2] for _ in range(6)] == [100, 150, 150, 150, 150, 500]
+
+
+def test_overlapping_encoder_jumps_end_one_by_one(on_the_bus: BusBenchFactory) -> None:
+    bench = on_the_bus(
+        {"kind": "encoder_jump", "amount": 20, "at_sync": 4, "duration_syncs": 3},
+        {"kind": "encoder_jump", "amount": 3, "at_sync": 5, "duration_syncs": 4},
+    ).start()
+    before = bench.read(0x6064, signed=True)
+    assert [position(data) - before for data in bench.tpdos(6)] == [20, 23, 23, 3, 3, 0]
+
+
 @pytest.mark.parametrize("kind", ["sto", "undervoltage"])
 def test_no_power(begun: Begin, kind: str) -> None:
     bench = begun(kind=kind, duration_syncs=5)
@@ -406,6 +425,13 @@ def test_what_is_no_fault_is_refused(on_the_bus: BusBenchFactory, fault: dict[st
     assert abort.value.code == 0x08000022
 
 
+def test_number_beyond_the_kinds(on_the_bus: BusBenchFactory) -> None:
+    bench = on_the_bus()
+    with pytest.raises(SdoAbortedError) as abort:
+        bench.write(0x5F00, 1, len(KINDS) + 1, 1)
+    assert abort.value.code == 0x06090031
+
+
 def test_no_kind_is_no_fault(on_the_bus: BusBenchFactory) -> None:
     bench = on_the_bus()
     with pytest.raises(SdoAbortedError):
@@ -457,7 +483,8 @@ def test_seconds_are_measured_in_real_time(on_the_bus: BusBenchFactory) -> None:
 
 
 def test_remote_frames(on_the_bus: BusBenchFactory) -> None:
-    bench = on_the_bus({"kind": "lost", "at_sync": 1, "direction": "received", "can_id": HEARTBEAT})
+    touched = {"direction": "received", "can_id": HEARTBEAT}
+    bench = on_the_bus({"kind": "doubled", **touched}, {"kind": "lost", "at_sync": 1, **touched})
     assert len(bench.request(HEARTBEAT)) == 1  # node guarding
     bench.syncs(2)
     assert bench.request(HEARTBEAT) == []

@@ -48,7 +48,8 @@ SERVED: dict[int, set[AbortCode]] = {
     0x1016: {INVALID},
     0x1019: {INVALID, DEVICE_STATE},  # not while there is a cycle period
     0x1029: {INVALID},
-    0x5F00: {DEVICE_STATE},  # begins only what the other sub-indices describe
+    # Begins only what the other sub-indices describe; the kinds' highest number is the drive's own.
+    0x5F00: {DEVICE_STATE, AbortCode.TOO_HIGH},
     0x6007: {INVALID},
     0x605A: {INVALID},
     0x605B: {INVALID},

@@ -3,19 +3,16 @@
 from collections.abc import Callable
 from typing import TypeAlias
 
+<<<<<<< HEAD
 from canwall.simdrive.state import DriveState
 
 Frame: TypeAlias = tuple[int, bytes]
 """A CAN data frame: 11-bit identifier and 0 to 8 bytes."""
+=======
+from canwall.frame import ERROR_FRAME, Frame
+>>>>>>> faults
 
-ERROR_FRAME = 0x20000000
-"""Bit of an identifier that makes a frame an error frame, as in SocketCAN (linux/can/error.h)."""
-
-BUS_OFF: Frame = (ERROR_FRAME | 0x40, bytes(8))
-"""A controller has left the bus."""
-
-CRC_ERROR: Frame = (ERROR_FRAME | 0x88, bytes.fromhex("0000000800000000"))
-"""Protocol violation on the bus: in the CRC sequence."""
+__all__ = ["ERROR_FRAME", "NS_PER_100_US", "NS_PER_MS", "NS_PER_US", "Clock", "Frame", "Send"]
 
 Send: TypeAlias = Callable[[Frame], None]
 """Hands a frame to the bus."""

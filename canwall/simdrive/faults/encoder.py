@@ -1,4 +1,4 @@
-"""An encoder that jumps or sticks, before the one of the motion."""
+"""An encoder that may jump or stick, between the motion and the drive."""
 
 from collections.abc import Callable
 from typing import Protocol
@@ -11,17 +11,17 @@ from canwall.simdrive.profile.power_drive_system import Motion
 
 
 class Advance(Protocol):
-    """Moves on by ``duration_s`` under a torque."""
+    """Signature of `Motion.advance`."""
 
     def __call__(self, torque_nm: float, duration_s: float) -> None:
-        """Move on."""
+        """Move on by ``duration_s`` under a torque."""
         ...
 
 
 class FaultyEncoder:
-    """Reads the motion, with an offset, or not at all any more.
+    """Reads the motion, with an offset where the encoder has jumped, or not at all.
 
-    While nothing is wrong, what the drive calls are the methods of the motion themselves.
+    Without a fault the drive calls the methods of the motion itself: nothing is slower.
     """
 
     counts: Callable[[], int]
@@ -30,7 +30,7 @@ class FaultyEncoder:
     advance: Advance
 
     def __init__(self, motion: Motion) -> None:
-        """Read truly at first."""
+        """Read the motion as it is."""
         self._motion = motion
         self._recorded = motion if isinstance(motion, RecordedMotion) else None
         self.advance = motion.advance
@@ -46,7 +46,7 @@ class FaultyEncoder:
         return self._recorded.record if self._recorded and true else None
 
     def jump(self, increments: int) -> None:
-        """Read so many increments more from now on."""
+        """Read this many increments more from now on."""
         self._offset += increments
         self.counts = self._counts if self._offset else self._motion.counts
 

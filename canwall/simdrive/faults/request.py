@@ -1,14 +1,12 @@
-"""The record by which a master asks for a fault over SDO (0x5F00)."""
+"""The object by which a master asks for a fault over SDO (0x5F00)."""
 
 import math
 from collections.abc import Callable
 
-from canwall.config import AMOUNTS, NUMBERS, ON_FRAMES, Direction
+from canwall.faults import INDEX, KINDS, Direction, PlannedFault
 from canwall.simdrive.communication.abort import AbortCode, AccessError
 from canwall.simdrive.communication.dictionary import Dictionary
-from canwall.simdrive.faults.plan import PlannedFault
 
-INDEX = 0x5F00
 _KIND, _AMOUNT, _CAN_ID, _DIRECTION, _PROBABILITY, _DURATION, _DELAY, _COMMAND, _COUNT = range(
     1, 10
 )
@@ -23,9 +21,9 @@ _FORMATS = {
     _COMMAND: "B",
     _COUNT: "H",
 }
-"""What the record is told by, in whosever dictionary its index is in use."""
+"""Types of the sub-indices: they tell the record from a vendor's object of the same index."""
 
-_KINDS = {number: kind for kind, number in NUMBERS.items()}
+_KINDS = {kind.number: kind for kind in KINDS.values()}
 _DIRECTIONS: tuple[Direction, ...] = ("sent", "received", "both")
 _ANY_CAN_ID = 0xFFFF
 _USUAL_AMOUNT = -(2**31)
@@ -33,7 +31,7 @@ _END_ALL, _BEGIN = 0, 1
 
 
 class FaultRequest:
-    """Serves 0x5F00: a fault is described in its sub-indices and begun by the command."""
+    """Serves 0x5F00: the sub-indices describe a fault, and the command begins it."""
 
     def __init__(
         self,
@@ -44,8 +42,8 @@ class FaultRequest:
         """Serve the object, if the dictionary has it.
 
         Args:
-            dictionary: has the entries.
-            ask: called with a fault whose begin is left open, and the SYNCs that it waits for.
+            dictionary: of the drive.
+            ask: called with a fault, its begin left open, and the number of SYNCs that it waits.
             end_all: called to end every fault, those that wait included.
         """
         self._ask = ask
@@ -57,7 +55,7 @@ class FaultRequest:
         ):
             return
         self._entries = {sub: dictionary[INDEX, sub] for sub in _FORMATS}
-        self._entries[_KIND].allow((0, *_KINDS))
+        self._entries[_KIND].allow((0, *_KINDS)).high = max(_KINDS)
         self._entries[_CAN_ID].allow((*range(0x800), _ANY_CAN_ID))
         self._entries[_DIRECTION].allow(range(len(_DIRECTIONS)))
         self._entries[_PROBABILITY].allow(range(1001))
@@ -65,7 +63,7 @@ class FaultRequest:
         self._entries[_COMMAND].react = self._obey
 
     def show(self, count: int) -> None:
-        """Let 0x5F00:09 show how many faults are present or waiting."""
+        """Set 0x5F00:09, the number of faults that are present or waiting."""
         if self._entries:
             self._entries[_COUNT].value = count
 
@@ -83,29 +81,26 @@ class FaultRequest:
             self._end_all()
 
     def _described(self) -> PlannedFault:
-        """Return the fault as the sub-indices have it.
+        """Return the fault that the sub-indices describe.
 
         Raises:
-            AccessError: DEVICE_STATE, they do not describe one.
+            AccessError: DEVICE_STATE, they describe none.
         """
         value = {sub: entry.value for sub, entry in self._entries.items()}
         kind = _KINDS.get(value[_KIND])
         if kind is None:
             raise AccessError(AbortCode.DEVICE_STATE)
         amount = 0
-        if kind in AMOUNTS:
-            limits = AMOUNTS[kind]
-            amount = limits.usual if value[_AMOUNT] == _USUAL_AMOUNT else value[_AMOUNT]
-            if not limits.lowest <= amount <= limits.highest:
+        if kind.amount:
+            amount = kind.amount.usual if value[_AMOUNT] == _USUAL_AMOUNT else value[_AMOUNT]
+            if amount not in kind.amount:
                 raise AccessError(AbortCode.DEVICE_STATE)
-        on_frames = kind in ON_FRAMES
-        with_id = on_frames or kind == "babbling"
-        can_id = value[_CAN_ID]
+        keys, can_id = kind.own_keys(), value[_CAN_ID]
         return PlannedFault(
             kind=kind,
-            periods=value[_DURATION] or (0.0 if kind == "reboot" else math.inf),
-            can_id=can_id if with_id and can_id != _ANY_CAN_ID else None,
-            direction=_DIRECTIONS[value[_DIRECTION]] if on_frames else "sent",
-            probability=value[_PROBABILITY] / 1000.0 if on_frames else 1.0,
+            periods=value[_DURATION] or (0.0 if kind.momentary else math.inf),
+            can_id=can_id if "can_id" in keys and can_id != _ANY_CAN_ID else None,
+            direction=_DIRECTIONS[value[_DIRECTION]] if "direction" in keys else kind.direction,
+            probability=value[_PROBABILITY] / 1000.0 if "probability" in keys else 1.0,
             amount=amount,
         )
