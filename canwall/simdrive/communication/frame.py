@@ -3,14 +3,8 @@
 from collections.abc import Callable
 from typing import TypeAlias
 
-<<<<<<< HEAD
-from canwall.simdrive.state import DriveState
-
-Frame: TypeAlias = tuple[int, bytes]
-"""A CAN data frame: 11-bit identifier and 0 to 8 bytes."""
-=======
 from canwall.frame import ERROR_FRAME, Frame
->>>>>>> faults
+from canwall.simdrive.state import DriveState
 
 __all__ = ["ERROR_FRAME", "NS_PER_100_US", "NS_PER_MS", "NS_PER_US", "Clock", "Frame", "Send"]
 
