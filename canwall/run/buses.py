@@ -13,7 +13,11 @@ from canwall.drive import Link, refuse_second_master
 
 
 def open_bus(settings: Settings) -> can.BusABC:
-    """The bus of `[bus]`. Raises ConfigError where there is none."""
+    """Open the bus of `[bus]`.
+
+    Raises:
+        ConfigError: there is none.
+    """
     bus = settings.bus
     try:
         return can.Bus(interface=bus.interface, channel=bus.channel, bitrate=bus.bitrate)
@@ -30,10 +34,15 @@ def open_bus(settings: Settings) -> can.BusABC:
 def make_simulated_drive(
     settings: Settings, report: Callable[[str], None] = lambda line: None
 ) -> simdrive.FaultyDrive:
-    """The drive of `[simulation]`, from the dictionary of `[drive]`.
+    """Make the drive of `[simulation]`, from the dictionary of `[drive]`.
 
-    report is told in a line when one of its faults begins or ends. Raises
-    ConfigError, DictionaryError.
+    Args:
+        settings: of the run.
+        report: called with a line when one of its faults begins or ends.
+
+    Raises:
+        ConfigError: there is no `[simulation]`.
+        DictionaryError: the dictionary is of no use.
     """
     if settings.simulation is None:
         raise ConfigError("[simulation] is missing: there is no drive to simulate")
@@ -49,10 +58,13 @@ def serve_drive(
     joined: Callable[[], None],
     report: Callable[[str], None] = lambda line: None,
 ) -> None:
-    """A simulated drive alone on its bus, until stopped (`canwall drive`).
+    """Serve a simulated drive alone on its bus, until stopped (`canwall drive`).
 
-    `joined` is called when it hears what is on the bus, report is told of its faults, and of the
-    bus being gone.
+    Args:
+        settings: of the drive.
+        stop: asked every millisecond or more often.
+        joined: called when the drive hears what is on the bus.
+        report: called with a line when a fault begins or ends, or the bus goes or comes back.
     """
     drive = make_simulated_drive(settings, report)
     with open_bus(settings) as bus:
@@ -65,9 +77,15 @@ def serve_drive(
 
 @contextmanager
 def on_the_bus(*many: Settings) -> Iterator[Link]:
-    """A link to the bus; embedded drives live on the same bus, in the master's idle time.
+    """Open a link to the bus; embedded drives live on the same bus, in the master's idle time.
 
-    Raises ConfigError and DictionaryError, DriveError where another master is on it.
+    One embedded drive is at the other end of a socket pair, where compiled code exchanges its
+    frames (`bus.exchange`); several, and others that python-can's virtual bus is to carry, on that.
+
+    Raises:
+        ConfigError: there is no such bus.
+        DictionaryError: a drive's dictionary is of no use.
+        DriveError: another master is on the bus.
     """
     if not many[0].embedded:
         with open_bus(many[0]) as bus:
@@ -78,7 +96,7 @@ def on_the_bus(*many: Settings) -> Iterator[Link]:
         return
     drives = [make_simulated_drive(settings) for settings in many]
     with ExitStack() as stack:
-        if len(many) == 1 and many[0].bus.exchange == "native":
+        if len(many) == 1 and _is_alone(many[0]):
             bus, drive_bus = (stack.enter_context(end) for end in socket_pair(many[0].bus.channel))
             runner = simdrive.SocketRunner(drives[0], drive_bus)
             yield Link(bus, runner.poll, runner.compiled)
@@ -89,6 +107,12 @@ def on_the_bus(*many: Settings) -> Iterator[Link]:
             for drive, settings in zip(drives, many, strict=True)
         ]
         yield Link(bus, idle=polls[0] if len(polls) == 1 else partial(_call_all, polls))
+
+
+def _is_alone(settings: Settings) -> bool:
+    """True if nobody but master and drive takes part: another producer of the SYNC would."""
+    bus = settings.bus
+    return bus.exchange == "native" or (bus.exchange == "auto" and bus.sync == "produce")
 
 
 def _call_all(functions: Sequence[Callable[[], None]]) -> None:

@@ -21,6 +21,10 @@ UNIXCAN_CONFIG = config.shipped("config/unixcan.toml")
 EDS = '"../eds/canwall-drive.eds"'
 
 
+#: An embedded drive is on python-can's virtual bus, where a test can listen.
+ON_VIRTUAL_BUS = {'exchange = "auto" ': 'exchange = "python-can" '}
+
+
 @pytest.fixture
 def listener() -> Iterator[VirtualBus]:
     """On the embedded bus from the beginning: what anybody sends can be heard."""
@@ -157,7 +161,7 @@ def test_bad_configuration(
     bad_eds(tmp_path / "bad.eds")
     eds_without(tmp_path / "no6064.eds", "6064")
     eds_without(tmp_path / "no6077.eds", "6077")
-    file = config_file(tmp_path / "config.toml", changes)
+    file = config_file(tmp_path / "config.toml", ON_VIRTUAL_BUS | changes)
     said = say("run", file, "--output", tmp_path / "run")
     assert said.code == 2
     assert line in said.line
@@ -199,6 +203,8 @@ def test_bad_arguments(
     bad_toml(tmp_path / "bad.toml")
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "signals.parquet").touch()
+    if arguments[0].startswith("--"):
+        arguments = [str(config_file(tmp_path / "c.toml", ON_VIRTUAL_BUS)), *arguments]
     before = sorted(tmp_path.rglob("*"))
     said = say("run", *arguments)
     assert said.code == 2

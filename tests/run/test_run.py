@@ -391,7 +391,7 @@ def test_bus_that_fails_before_the_first_cycle(
 
     monkeypatch.setattr(canwall.run.buses, "open_bus", lambda settings: NoSync("no sync"))
     with pytest.raises(RunFailedError, match="the bus failed: transmit buffer full"):
-        canwall.run.run(settings_with(), tmp_path / "run")
+        canwall.run.run(settings_with({"bus.exchange": "python-can"}), tmp_path / "run")
 
 
 def test_record_that_is_lost(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
