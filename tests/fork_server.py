@@ -1,15 +1,16 @@
 """Processes that begin with canwall imported, because they are forked from one that has it.
 
 `ForkedPopen` is `subprocess.Popen` for commands of this Python and of the scripts installed beside
-it. The process is a real one: a child of the caller with its own standard streams, folder, environment,
-session and signals, that ends as any interpreter does. Only the start of the interpreter and the
-imports are left out, which take seconds. Tests of these use `subprocess.Popen`, and so do tests of
-what libraries decide as they are imported (from MPLCONFIGDIR, NUMBA_CPU_NAME, TERM).
+it. The process is a real one: a child of the caller with standard streams, folder, environment,
+session and signals of its own, that ends as an interpreter does. Only the start of the interpreter
+and the imports are left out, which take seconds. Tests of these use `subprocess.Popen`, and so do
+tests of what libraries decide as they are imported (from MPLCONFIGDIR, NUMBA_CPU_NAME, TERM).
 
-This file is the server's program as well.
+This file is also the program of the server that forks them, and has nothing else to do meanwhile.
 """
 
 import atexit
+import contextlib
 import ctypes
 import gc
 import io
@@ -22,12 +23,14 @@ import subprocess
 import sys
 import tempfile
 import threading
+import traceback
 import types
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, AnyStr, TextIO
+from typing import Any, AnyStr, NoReturn, TextIO
 
 PYTHON = Path(sys.executable)
 #: The installed command, a script of Python like `dask`.
@@ -56,16 +59,129 @@ class ForkedPopen(subprocess.Popen[AnyStr]):
         streams = (pipes[0], pipes[3], pipes[5])
         descriptors = {n: n if stream == -1 else stream for n, stream in enumerate(streams)}
         descriptors |= {descriptor: descriptor for descriptor in pass_fds}
-        request = {
-            "arguments": list(args),
-            "folder": os.fspath(folder or os.getcwd()),
-            "environment": dict(os.environ if environment is None else environment),
-            "new_session": self._new_session,
-            "descriptors": list(descriptors),
-        }
-        self.pid = _server().fork(request, list(descriptors.values()))
+        program = Program(
+            [str(word) for word in args],
+            os.fspath(folder or os.getcwd()),
+            dict(os.environ if environment is None else environment),
+            self._new_session,
+            list(descriptors),
+        )
+        self.pid = self._fork(program, list(descriptors.values()))
         self._child_created = True
         self._close_pipe_fds(*pipes)  # type: ignore[attr-defined]
+
+    def _fork(self, program: "Program", descriptors: Sequence[int]) -> int:
+        return _server().fork(program, descriptors)
+
+
+class PopenByFork(ForkedPopen[AnyStr]):
+    """The same forked from the caller, who has imported all that is needed."""
+
+    def _fork(self, program: "Program", descriptors: Sequence[int]) -> int:
+        if (child := _fork()) != 0:
+            return child
+        gc.freeze()  # what the caller has open is not closed here
+        atexit._clear()
+        program.become(descriptors)
+
+
+@dataclass(frozen=True)
+class Program:
+    """A process to be."""
+
+    arguments: list[str]
+    folder: str
+    environment: dict[str, str]
+    new_session: bool
+    #: The numbers that the descriptors it is given have there; all others are closed.
+    descriptors: list[int]
+
+    def become(self, given: Sequence[int]) -> NoReturn:
+        """Be this program in this process; given: what is to have the numbers of descriptors."""
+        status: object = 1
+        try:
+            self._take_over(given)
+            self._run()
+            status = 0
+        except SystemExit as end:
+            status = end.code or 0
+            if isinstance(status, str):
+                print(status, file=sys.stderr)
+        except BaseException as error:
+            traceback.print_exc()
+            if isinstance(error, KeyboardInterrupt):
+                signal.signal(signal.SIGINT, signal.SIG_DFL)
+                signal.raise_signal(signal.SIGINT)
+        threading._shutdown()  # type: ignore[attr-defined]
+        atexit._run_exitfuncs()
+        with contextlib.suppress(OSError):
+            sys.stdout.flush()
+        # To take down all that is imported would mean to copy it first.
+        os._exit(status if isinstance(status, int) else 1)
+
+    def _take_over(self, given: Sequence[int]) -> None:
+        """Have descriptors, session, folder, environment and signals of its own."""
+        # First to numbers that nobody wants.
+        aside = max(*self.descriptors, *given) + 1
+        for n, descriptor in enumerate(given):
+            os.dup2(descriptor, aside + n)
+        os.closerange(0, aside)
+        for n, descriptor in enumerate(self.descriptors):
+            os.dup2(aside + n, descriptor)
+        os.closerange(aside, os.sysconf("SC_OPEN_MAX"))
+        if self.new_session:
+            os.setsid()
+        os.chdir(self.folder)
+        before = _search_path(os.environ)
+        os.environ.clear()
+        os.environ.update(self.environment)
+        sys.path[: len(before)] = _search_path(os.environ)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def _run(self) -> None:
+        """Do what Python does with the arguments."""
+        program, *words = self.arguments
+        options = set()
+        kind = "script"
+        if program == str(PYTHON):
+            while words[0] in ("-u", "-P"):
+                options.add(words.pop(0))
+            kind, program, *words = words
+        sys.stdin = sys.__stdin__ = open(0, closefd=False)  # noqa: SIM115
+        sys.stdout = sys.__stdout__ = _output(1, "-u" in options)
+        sys.stderr = sys.__stderr__ = _output(2, "-u" in options)
+        sys.argv = ["-c" if kind == "-c" else program, *words]
+        if "-P" not in options:
+            sys.path.insert(0, {"script": str(PYTHON.parent), "-m": os.getcwd(), "-c": ""}[kind])
+        if kind == "script":
+            runpy.run_path(program, run_name="__main__")
+        elif kind == "-m":
+            sys.modules.pop(program, None)
+            runpy.run_module(program, run_name="__main__", alter_sys=True)
+        else:
+            sys.modules["__main__"] = main = types.ModuleType("__main__")
+            exec(compile(program, "<string>", "exec"), main.__dict__)
+
+
+def _search_path(environment: Mapping[str, str]) -> list[str]:
+    return list(filter(None, environment.get("PYTHONPATH", "").split(os.pathsep)))
+
+
+def _output(descriptor: int, unbuffered: bool) -> TextIO:
+    binary = open(descriptor, "wb", 0 if unbuffered else -1, closefd=False)  # noqa: SIM115
+    return io.TextIOWrapper(
+        binary,
+        errors="backslashreplace" if descriptor == 2 else "strict",
+        line_buffering=descriptor == 2 or binary.isatty(),
+        write_through=unbuffered,
+    )
+
+
+def _fork() -> int:
+    with warnings.catch_warnings():
+        # Threads of the libraries: they know of forking, and are idle.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        return os.fork()
 
 
 class _Server:
@@ -82,16 +198,17 @@ class _Server:
             )
         atexit.register(self._close)
 
-    def fork(self, request: Mapping[str, object], descriptors: Sequence[int]) -> int:
-        """Have a process forked that has these descriptors under the numbers of the request.
+    def fork(self, program: Program, descriptors: Sequence[int]) -> int:
+        """Have a process forked for the program; returns its number.
 
-        Returns its process number. The process in between that forks it ends at once; an orphan
-        goes to its nearest ancestor that takes orphans, which is this process meanwhile.
+        What forks it there ends at once, and an orphan goes to its nearest ancestor that takes
+        orphans, which is this process meanwhile.
         """
+        request = json.dumps(asdict(program)).encode()
         with self._lock:
             _take_orphans(True)
             try:
-                socket.send_fds(self._socket, [json.dumps(request).encode()], descriptors)
+                socket.send_fds(self._socket, [request], descriptors)
                 answer = self._socket.recv(64)
             finally:
                 _take_orphans(False)
@@ -125,13 +242,16 @@ def load() -> None:
 
     import canwall.bench
     import canwall.cli
+    import canwall.record.recorder
     import canwall.record.writer
     import canwall.run
     import canwall.study
     import canwall.sweep
-    import canwall.workbench  # noqa: F401
+    import canwall.workbench
     from canwall import config
 
+    forking = types.SimpleNamespace(**{**vars(subprocess), "Popen": PopenByFork})
+    canwall.record.recorder.subprocess = forking  # type: ignore[attr-defined]
     for exchange in ("python-can", "native"):
         given = {"run.duration_s": 0.05, "bus.exchange": exchange}
         settings = config.load(config.shipped("config/sim.toml"), given)
@@ -140,13 +260,10 @@ def load() -> None:
 
 
 def serve(requests: socket.socket) -> None:
-    """Fork a process for each request, until there are no more of them.
-
-    Each of these processes leaves with its program's exception, or returns at its program's end.
-    """
+    """Fork a process for each request, until there are no more of them."""
     while True:
-        request, descriptors = _receive(requests)
-        if request is None:
+        request, descriptors, _, _ = socket.recv_fds(requests, _REQUEST_BYTES, _MOST_DESCRIPTORS)
+        if not request:
             return
         parted, part = os.pipe()
         number, tell = os.pipe()
@@ -160,9 +277,7 @@ def serve(requests: socket.socket) -> None:
             os.close(part)
             os.read(parted, 1)
             requests.detach()
-            _take_over(request, descriptors)
-            _run(request["arguments"])
-            return
+            Program(**json.loads(request)).become(descriptors)
         os.waitpid(between, 0)
         requests.send(os.read(number, 64))
         for descriptor in (parted, part, number, tell, *descriptors):
@@ -172,78 +287,6 @@ def serve(requests: socket.socket) -> None:
 def _receive(requests: socket.socket) -> tuple[dict[str, Any] | None, list[int]]:
     data, descriptors, _, _ = socket.recv_fds(requests, _REQUEST_BYTES, _MOST_DESCRIPTORS)
     return (json.loads(data) if data else None), descriptors
-
-
-def _fork() -> int:
-    with warnings.catch_warnings():
-        # Threads of the libraries: they know of forking, and are idle.
-        warnings.simplefilter("ignore", DeprecationWarning)
-        return os.fork()
-
-
-def _take_over(request: Mapping[str, Any], descriptors: Sequence[int]) -> None:
-    """Have what the new process is given: descriptors, session, folder, environment, signals."""
-    wanted = request["descriptors"]
-    # First to numbers that nobody wants.
-    aside = max(*wanted, *descriptors) + 1
-    for n, descriptor in enumerate(descriptors):
-        os.dup2(descriptor, aside + n)
-    os.closerange(0, aside)
-    for n, descriptor in enumerate(wanted):
-        os.dup2(aside + n, descriptor)
-    os.closerange(aside, os.sysconf("SC_OPEN_MAX"))
-    if request["new_session"]:
-        os.setsid()
-    os.chdir(request["folder"])
-    loaded_with = _search_path(os.environ)
-    os.environ.clear()
-    os.environ.update(request["environment"])
-    sys.path[: len(loaded_with)] = _search_path(os.environ)
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-def _search_path(environment: Mapping[str, str]) -> list[str]:
-    return list(filter(None, environment.get("PYTHONPATH", "").split(os.pathsep)))
-
-
-def _run(arguments: Sequence[str]) -> None:
-    """Be Python, or a script of it, with these arguments."""
-    program, *words = arguments
-    unbuffered = False
-    if program == str(PYTHON):
-        while words[0] == "-u":
-            unbuffered = True
-            del words[0]
-    sys.stdin = sys.__stdin__ = open(0, closefd=False)  # noqa: SIM115
-    sys.stdout = sys.__stdout__ = _output(1, unbuffered)
-    sys.stderr = sys.__stderr__ = _output(2, unbuffered)
-    sys.orig_argv = [*arguments]
-    if program != str(PYTHON):
-        sys.argv = [*arguments]
-        sys.path.insert(0, str(Path(program).parent))
-        runpy.run_path(program, run_name="__main__")
-    elif words[0] == "-m":
-        name, sys.argv = words[1], words[1:]
-        sys.path.insert(0, os.getcwd())
-        sys.modules.pop(name, None)
-        runpy.run_module(name, run_name="__main__", alter_sys=True)
-    elif words[0] == "-c":
-        sys.argv = ["-c", *words[2:]]
-        sys.path.insert(0, "")
-        sys.modules["__main__"] = main = types.ModuleType("__main__")
-        exec(compile(words[1], "<string>", "exec"), main.__dict__)
-    else:
-        raise ValueError(f"options of Python that are not known here: {words}")
-
-
-def _output(descriptor: int, unbuffered: bool) -> TextIO:
-    binary = open(descriptor, "wb", 0 if unbuffered else -1, closefd=False)  # noqa: SIM115
-    return io.TextIOWrapper(
-        binary,
-        errors="backslashreplace" if descriptor == 2 else "strict",
-        line_buffering=descriptor == 2 or binary.isatty(),
-        write_through=unbuffered,
-    )
 
 
 if __name__ == "__main__":
