@@ -14,13 +14,13 @@ from typing import Any, TypeAlias
 import can
 import numpy as np
 import pyarrow as pa
+from fork_server import COMMAND, ForkedPopen
 from numpy.typing import NDArray
 from rig import RPDO1, SIM_CONFIG, SYNC, TPDO1
 
 from canwall import config
 from canwall.record import read_signals
 
-COMMAND = str(Path(sys.executable).with_name("canwall"))
 PATIENCE_S = 60.0
 
 #: Changes of a shipped configuration, in real time. A machine that has other things to do is not to
@@ -38,7 +38,30 @@ Start: TypeAlias = Callable[..., "subprocess.Popen[str]"]
 
 
 def command(*arguments: object, cwd: Path | None = None) -> "subprocess.CompletedProcess[str]":
-    """`canwall ARGUMENTS`, waited for."""
+    """Run `canwall ARGUMENTS` in a forked process, see `fork_server`."""
+    return _forked([COMMAND, *map(str, arguments)], cwd)
+
+
+def python(*arguments: object, cwd: Path | None = None) -> "subprocess.CompletedProcess[str]":
+    """Run `python ARGUMENTS` in a forked process."""
+    return _forked([sys.executable, *map(str, arguments)], cwd)
+
+
+def _forked(words: list[str], cwd: Path | None) -> "subprocess.CompletedProcess[str]":
+    pipe = subprocess.PIPE
+    with ForkedPopen[str](words, stdout=pipe, stderr=pipe, text=True, cwd=cwd) as process:
+        try:
+            out, errors = process.communicate(timeout=PATIENCE_S)
+        except BaseException:
+            process.kill()
+            raise
+    return subprocess.CompletedProcess(words, process.returncode, out, errors)
+
+
+def installed_command(
+    *arguments: object, cwd: Path | None = None
+) -> "subprocess.CompletedProcess[str]":
+    """Run `canwall ARGUMENTS` as from a shell, its start included."""
     return subprocess.run(
         [COMMAND, *map(str, arguments)],
         capture_output=True,

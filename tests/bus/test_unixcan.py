@@ -20,6 +20,7 @@ from pathlib import Path
 import can
 import canopen
 import pytest
+from fork_server import ForkedPopen
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -56,7 +57,7 @@ def spawn() -> Iterator[Spawn]:
     with contextlib.ExitStack() as stack:
 
         def start(*command: str) -> "subprocess.Popen[str]":
-            process = subprocess.Popen(
+            process = ForkedPopen[str](
                 [sys.executable, "-u", *command],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
