@@ -7,8 +7,13 @@ theme brings its fonts and scripts along, and searching works on an index in the
 import importlib.metadata
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numba
+from pydantic import BaseModel
+
+if TYPE_CHECKING:
+    from sphinx.application import Sphinx
 
 sys.path.insert(0, str(Path(__file__).parent / "extensions"))
 
@@ -64,5 +69,19 @@ napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
+autodoc_default_options = {"exclude-members": "model_config"}
 python_use_unqualified_type_names = True
 maximum_signature_line_length = 88
+
+
+def _without_keys(
+    _app: object, _what: str, _name: str, described: object, *_rest: object
+) -> tuple[str, str] | None:
+    """Leave the keys of a section of the configuration to the page about them."""
+    is_section = isinstance(described, type) and issubclass(described, BaseModel)
+    return ("", "") if is_section else None
+
+
+def setup(app: "Sphinx") -> None:
+    """Adapt what autodoc shows."""
+    app.connect("autodoc-process-signature", _without_keys)

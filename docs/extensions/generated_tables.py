@@ -2,15 +2,20 @@
 
 import inspect
 import re
+import types
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin
 
+import tomli_w
 import typer
 from docutils import nodes
+from pydantic import BaseModel
 from sphinx.util.docutils import SphinxDirective
 
 from canwall.analysis import DESCRIBED
 from canwall.cli import app as commands
+from canwall.config import Settings
 from canwall.record import ring
 
 if TYPE_CHECKING:
@@ -78,6 +83,82 @@ class Commands(_Generated):
         return f"`{shown}`", parameter.help, default
 
 
+#: What TOML calls the types, and a word for each bound of a number.
+_IN_TOML = {
+    float: "number",
+    int: "integer",
+    bool: "boolean",
+    str: "string",
+    Path: "path",
+    dict: "table",
+    tuple: "array",
+}
+_BOUNDS = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
+
+
+class ConfigurationKeys(_Generated):
+    """Every section of the configuration with its keys: `{configuration-keys}`."""
+
+    def lines(self) -> Iterator[str]:
+        """Sections of the third level."""
+        yield from self._section("", Settings)
+
+    def _section(self, path: str, section: type[BaseModel]) -> Iterator[str]:
+        rows, inner = [], []
+        for key, field in section.model_fields.items():
+            nested = _sections_in(field.annotation)
+            if nested:
+                name = f"{path}{key}"
+                is_array = get_origin(field.annotation) is tuple
+                inner.append((f"[[{name}]]" if is_array else f"[{name}]", f"{name}.", nested[0]))
+            elif path:
+                values = _values(field.annotation, field.metadata)
+                default = "required"
+                if not field.is_required():
+                    default = _default(field.get_default(call_default_factory=True))
+                rows.append((f"`{key}`", values, default))
+        if rows:
+            yield from ("", *_table(("key", "value", "default"), rows), "")
+        for heading, below, model in inner:
+            yield from ("", f"### `{heading}`", "")
+            yield from self._section(below, model)
+
+
+def _sections_in(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [found for part in get_args(annotation) for found in _sections_in(part)]
+
+
+def _values(annotation: Any, metadata: Sequence[Any] = ()) -> str:
+    """What a key may be, in TOML's words."""
+    if hasattr(annotation, "__metadata__"):
+        return _values(annotation.__origin__, [*metadata, *annotation.__metadata__])
+    for inner in metadata:  # pydantic keeps the bounds of an optional number in a field of its own
+        if hasattr(inner, "metadata"):
+            return _values(annotation, [m for m in metadata if m is not inner] + inner.metadata)
+    origin = get_origin(annotation)
+    if origin in (Union, types.UnionType):
+        parts = [part for part in get_args(annotation) if part is not type(None)]
+        return " or ".join(dict.fromkeys(_values(part, metadata) for part in parts))
+    if origin is Literal:
+        return ", ".join(f'`"{value}"`' for value in get_args(annotation))
+    bounds = [
+        f"{sign} {getattr(item, name):g}"
+        for item in metadata
+        for name, sign in _BOUNDS.items()
+        if getattr(item, name, None) is not None
+    ]
+    return " ".join([_IN_TOML[origin or annotation], ", ".join(bounds)]).strip()
+
+
+def _default(value: Any) -> str:
+    if value is None:
+        return ""
+    value = list(value) if isinstance(value, tuple) else value
+    return f"`{tomli_w.dumps({'key': value}).partition(' = ')[2].strip()}`" if value != {} else ""
+
+
 class RecordedColumns(_Generated):
     """The columns of `signals.parquet`: `{recorded-columns}`."""
 
@@ -104,6 +185,7 @@ class SweepMeasures(_Generated):
 def setup(app: "Sphinx") -> dict[str, Any]:
     """Register the directives."""
     app.add_directive("canwall-commands", Commands)
+    app.add_directive("configuration-keys", ConfigurationKeys)
     app.add_directive("recorded-columns", RecordedColumns)
     app.add_directive("sweep-measures", SweepMeasures)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
