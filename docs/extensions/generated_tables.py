@@ -1,0 +1,191 @@
+"""Tables that are read from the code while the site is built, so that they cannot go stale."""
+
+import inspect
+import re
+import types
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin
+
+import tomli_w
+import typer
+from docutils import nodes
+from pydantic import BaseModel
+from sphinx.util.docutils import SphinxDirective
+
+from canwall.analysis import DESCRIBED
+from canwall.cli import app as commands
+from canwall.config import Settings
+from canwall.record import ring
+
+if TYPE_CHECKING:
+    from sphinx.application import Sphinx
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return ["| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines]
+
+
+class _Generated(SphinxDirective):
+    """A directive whose text is made here."""
+
+    def run(self) -> list[nodes.Node]:
+        text = "\n".join(self.lines())
+        return self.parse_text_to_nodes(text, allow_section_headings=True)
+
+    def lines(self) -> Iterator[str]:
+        """Markdown."""
+        raise NotImplementedError
+
+
+class Commands(_Generated):
+    """Every command of `canwall` with its arguments and options: `{canwall-commands}`."""
+
+    def lines(self) -> Iterator[str]:
+        """Sections of the second level."""
+        yield from self._group("canwall", typer.main.get_command(commands))
+
+    def _group(self, path: str, group: Any) -> Iterator[str]:
+        for name, command in group.commands.items():
+            if hasattr(command, "commands"):
+                yield from self._group(f"{path} {name}", command)
+            else:
+                yield from self._command(f"{path} {name}", command)
+
+    def _command(self, name: str, command: Any) -> Iterator[str]:
+        usage = " ".join(self._usage(command))
+        yield from ("", f"## {name}", "", f"`{name} {usage}`", "")
+        yield inspect.cleandoc(command.help)
+        rows = [self._row(parameter) for parameter in command.params if parameter.help]
+        yield from ("", *_table(("", "", "default"), rows), "")
+
+    @staticmethod
+    def _usage(command: Any) -> Iterator[str]:
+        for parameter in command.params:
+            text = parameter.metavar or parameter.name.upper()
+            if parameter.param_type_name == "option":
+                if not parameter.required:
+                    continue
+                text = f"{parameter.opts[0]} {text}"
+            text += "..." if parameter.nargs < 0 else ""
+            yield text if parameter.required else f"[{text}]"
+        yield "[OPTIONS]"
+
+    @staticmethod
+    def _row(parameter: Any) -> tuple[str, str, str]:
+        if parameter.param_type_name == "argument":
+            return f"`{parameter.metavar or parameter.name.upper()}`", parameter.help, ""
+        shown = parameter.opts[0] + (f" {parameter.metavar}" if parameter.metavar else "")
+        given = parameter.default if parameter.default is not None else ""
+        default = "" if parameter.is_flag or given == "" else f"`{given}`"
+        return f"`{shown}`", parameter.help, default
+
+
+#: What TOML calls the types, and a word for each bound of a number.
+_IN_TOML = {
+    float: "number",
+    int: "integer",
+    bool: "boolean",
+    str: "string",
+    Path: "path",
+    dict: "table",
+    tuple: "array",
+}
+_BOUNDS = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
+
+
+class ConfigurationKeys(_Generated):
+    """Every section of the configuration with its keys: `{configuration-keys}`."""
+
+    def lines(self) -> Iterator[str]:
+        """Sections of the third level."""
+        yield from self._section("", Settings)
+
+    def _section(self, path: str, section: type[BaseModel]) -> Iterator[str]:
+        rows, inner = [], []
+        for key, field in section.model_fields.items():
+            nested = _sections_in(field.annotation)
+            if nested:
+                name = f"{path}{key}"
+                is_array = get_origin(field.annotation) is tuple
+                inner.append((f"[[{name}]]" if is_array else f"[{name}]", f"{name}.", nested[0]))
+            elif path:
+                values = _values(field.annotation, field.metadata)
+                default = "required"
+                if not field.is_required():
+                    default = _default(field.get_default(call_default_factory=True))
+                rows.append((f"`{key}`", values, default))
+        if rows:
+            yield from ("", *_table(("key", "value", "default"), rows), "")
+        for heading, below, model in inner:
+            yield from ("", f"### `{heading}`", "")
+            yield from self._section(below, model)
+
+
+def _sections_in(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [found for part in get_args(annotation) for found in _sections_in(part)]
+
+
+def _values(annotation: Any, metadata: Sequence[Any] = ()) -> str:
+    """What a key may be, in TOML's words."""
+    if hasattr(annotation, "__metadata__"):
+        return _values(annotation.__origin__, [*metadata, *annotation.__metadata__])
+    for inner in metadata:  # pydantic keeps the bounds of an optional number in a field of its own
+        if hasattr(inner, "metadata"):
+            return _values(annotation, [m for m in metadata if m is not inner] + inner.metadata)
+    origin = get_origin(annotation)
+    if origin in (Union, types.UnionType):
+        parts = [part for part in get_args(annotation) if part is not type(None)]
+        return " or ".join(dict.fromkeys(_values(part, metadata) for part in parts))
+    if origin is Literal:
+        return ", ".join(f'`"{value}"`' for value in get_args(annotation))
+    bounds = [
+        f"{sign} {getattr(item, name):g}"
+        for item in metadata
+        for name, sign in _BOUNDS.items()
+        if getattr(item, name, None) is not None
+    ]
+    return " ".join([_IN_TOML[origin or annotation], ", ".join(bounds)]).strip()
+
+
+def _default(value: Any) -> str:
+    if value is None:
+        return ""
+    value = list(value) if isinstance(value, tuple) else value
+    return f"`{tomli_w.dumps({'key': value}).partition(' = ')[2].strip()}`" if value != {} else ""
+
+
+class RecordedColumns(_Generated):
+    """The columns of `signals.parquet`: `{recorded-columns}`."""
+
+    def lines(self) -> Iterator[str]:
+        """A table of name, type, and unit and meaning as ROW has them in its comments."""
+        source = inspect.getsource(ring).partition("ROW = ")[2].partition("align=True")[0]
+        comments = dict(re.findall(r'\("(\w+)", "[^"]+"\),(?:  # (.*))?', source))
+        rows = [
+            (f"`{name}`", "text" if name == "law" else f"{ring.ROW[name]}", comments[name])
+            for name in ring.ROW.names or ()
+        ]
+        yield from _table(("column", "type", "meaning"), rows)
+
+
+class SweepMeasures(_Generated):
+    """What a sweep measures of each strike: `{sweep-measures}`."""
+
+    def lines(self) -> Iterator[str]:
+        """A table of name, unit and meaning."""
+        rows = [(f"`{name}`", unit, meaning) for name, (unit, meaning) in DESCRIBED.items()]
+        yield from _table(("variable", "unit", "meaning"), rows)
+
+
+def setup(app: "Sphinx") -> dict[str, Any]:
+    """Register the directives."""
+    app.add_directive("canwall-commands", Commands)
+    app.add_directive("configuration-keys", ConfigurationKeys)
+    app.add_directive("recorded-columns", RecordedColumns)
+    app.add_directive("sweep-measures", SweepMeasures)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
