@@ -1,7 +1,7 @@
-"""Reading object dictionaries: EDS and DCF files (CiA 306), through the canopen package.
+"""Reading of object dictionaries: EDS and DCF files (CiA 306), with the canopen package.
 
-The package's parser stumbles over much that CiA 306 allows and vendors write. So a file is read
-here, put into the one form that the parser understands, and only then handed over.
+The parser of the package fails on much that CiA 306 allows and vendors write. A file is therefore
+read here, normalised to the form that the parser understands, and then passed to it.
 """
 
 import io
@@ -48,30 +48,34 @@ _NO_NUMBERS = datatypes.DATA_TYPES
 _OBJECT = re.compile(r"([0-9A-F]{4})(?:(SUB)([0-9A-F]+)|(NAME|VALUE))?", re.IGNORECASE)
 _NODE_ID = re.compile(r"\$?NODEID", re.IGNORECASE)
 _OCTAL = re.compile(r"0[0-7]+")
+#: Sections without objects; they have entries that the parser would insist on.
 _NO_OBJECTS = ("fileinfo", "deviceinfo", "devicecomissioning", "comments")
-"""What says nothing of the objects, and has entries that the parser insists on. It insists on
-[DeviceInfo] as well, empty or not."""
 
 _DOMAIN_OBJECT = 0x2
+#: Defaults of CiA 306 for a DOMAIN.
 _DOMAIN = {"ObjectType": f"0x{_DOMAIN_OBJECT:X}", "DataType": "0x000F", "AccessType": "rw"}
-"""What CiA 306 takes a DOMAIN to be where the file does not say."""
 
 
 def load_eds(path: Path, node_id: int, required: Iterable[int] = ()) -> ObjectDictionary:
-    """The object dictionary that a file describes, for a node.
+    """Load the object dictionary of an EDS or DCF.
 
-    Raises DictionaryError for a file that is missing or not an EDS, or that lacks one of the
-    `required` objects (indices).
+    Args:
+        path: The file.
+        node_id: Node-ID that replaces $NODEID in values.
+        required: Indices of objects that the dictionary has to have.
+
+    Raises:
+        DictionaryError: If the file is missing, not an EDS or DCF, or lacks a required object.
     """
     if not path.is_file():
         raise DictionaryError(f"{path}: no such EDS or DCF; correct drive.eds, or give --eds")
-    # canopen logs a traceback for an odd entry and goes on; what matters is missed below.
+    # canopen logs a traceback for an odd entry and continues; required objects are checked below.
     logging.getLogger("canopen.objectdictionary").setLevel(logging.CRITICAL)
     try:
-        file = io.StringIO(_as_text(_normal(_sections(path), node_id)))
+        file = io.StringIO(_as_text(_normalise(_read_sections(path), node_id)))
         file.name = path.name
         dictionary = canopen.import_od(file, node_id)
-    except Exception as error:  # the parser lets configparser, ValueError, KeyError … through
+    except Exception as error:  # configparser errors, ValueError, KeyError and others
         text = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise DictionaryError(f"{path}: not a readable EDS or DCF: {text}") from None
     missing = [index for index in required if index not in dictionary]
@@ -81,14 +85,14 @@ def load_eds(path: Path, node_id: int, required: Iterable[int] = ()) -> ObjectDi
     return dictionary
 
 
-def _sections(path: Path) -> _Sections:
-    """What the file says: sections and keys, spelt as CiA 306 spells them."""
+def _read_sections(path: Path) -> _Sections:
+    """Read the sections, with names and keys in the spelling of CiA 306."""
     raw = path.read_bytes()
     try:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError:
         text = raw.decode("latin-1")
-    # A key may occur twice, the last one counting; indented lines continue none.
+    # The last one of repeated keys counts; an indented line does not continue the one before.
     parser = RawConfigParser(strict=False, delimiters=("=",), inline_comment_prefixes=(";",))
     parser.read_file(line.strip() for line in io.StringIO(text, newline=None))
     sections: _Sections = {}
@@ -106,9 +110,9 @@ def _section_name(name: str) -> str:
     return index.upper() + (f"sub{int(subindex, 16):X}" if sub else (rest or "").capitalize())
 
 
-def _normal(sections: _Sections, node_id: int) -> _Sections:
-    """The same dictionary without what the parser cannot read."""
-    normal: _Sections = {"DeviceInfo": {}}
+def _normalise(sections: _Sections, node_id: int) -> _Sections:
+    """Return the same dictionary without what the parser cannot read."""
+    normal: _Sections = {"DeviceInfo": {}}  # the parser requires this section
     for name, section in sections.items():
         match = _OBJECT.fullmatch(name)
         if match is None:
@@ -117,12 +121,12 @@ def _normal(sections: _Sections, node_id: int) -> _Sections:
             elif name.lower() not in _NO_OBJECTS:
                 normal[name] = section
         elif not match.group(4):
-            normal |= _expanded(name, section, sections)
-    return {name: _resolved(section, node_id) for name, section in sorted(normal.items())}
+            normal |= _expand(name, section, sections)
+    return {name: _resolve_numbers(section, node_id) for name, section in sorted(normal.items())}
 
 
-def _expanded(name: str, section: _Section, sections: Mapping[str, _Section]) -> _Sections:
-    """An object by its sub-indices, where the file tells of them all at once."""
+def _expand(name: str, section: _Section, sections: Mapping[str, _Section]) -> _Sections:
+    """Expand CompactSubObj to a section per sub-index."""
     head = {key: value for key, value in section.items() if value or key == "ParameterName"}
     entries = int(head.pop("CompactSubObj", "") or "0", 0)
     if not entries:
@@ -148,15 +152,15 @@ def _expanded(name: str, section: _Section, sections: Mapping[str, _Section]) ->
     return expanded
 
 
-def _resolved(section: _Section, node_id: int) -> _Section:
-    """A section whose numbers have no node-ID in them and no leading zeros."""
+def _resolve_numbers(section: _Section, node_id: int) -> _Section:
+    """Replace $NODEID and leading zeros in the numbers of a section."""
     if int(section.get("DataType") or "0", 0) in _NO_NUMBERS:
         return section
-    numbers = {key: _number(section[key], node_id) for key in _NUMBERS if key in section}
+    numbers = {key: _resolve_number(section[key], node_id) for key in _NUMBERS if key in section}
     return section | numbers
 
 
-def _number(text: str, node_id: int) -> str:
+def _resolve_number(text: str, node_id: int) -> str:
     terms = _NODE_ID.sub(str(node_id), text).replace(" ", "").split("+")
     terms = [f"0o{term}" if _OCTAL.fullmatch(term) else term for term in terms]
     return str(sum(int(term, 0) for term in terms)) if len(terms) > 1 else terms[0]

@@ -1,9 +1,9 @@
-"""The two kinds of failure that a user sees; the text of each is one line for him."""
+"""The two kinds of failure that a user sees; the text of each is one line."""
 
 
 class InputError(ValueError):
-    """What was given cannot be used: the text says what, where, and what to do. Exit code 2."""
+    """Input that cannot be used; the text says what, where, and what to do. Exit code 2."""
 
 
 class RunFailedError(Exception):
-    """What was asked for failed while it ran. Exit code 1."""
+    """Failure of a run. Exit code 1."""

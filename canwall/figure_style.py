@@ -1,10 +1,10 @@
-"""Colours and style that all figures share; loads no plotting library."""
+"""Colours and style of all figures; imports no plotting library."""
 
 from typing import Any
 
-#: Colours that stay apart for colour-blind readers (Okabe and Ito, 2008).
+#: Colours that colour-blind readers can distinguish (Okabe and Ito, 2008).
 COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442", "#000000")
-#: What all figures of the project look like: rcParams for `matplotlib.rc_context`.
+#: rcParams for `matplotlib.rc_context`.
 STYLE: Any = {
     "font.size": 9,
     "axes.titlesize": 10,

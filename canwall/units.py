@@ -1,8 +1,8 @@
-"""Counts and per mille of the drive ↔ radians and newton metres of the wall: the one place.
+"""Conversion between the units of the drive and those of the wall.
 
-CiA 402 drives give positions in encoder increments and take torque in per mille of the rated
-torque. Both scales stand in the drive's own objects; what rounding the bus imposes is applied
-here and nowhere else, so the torque that the laws reckon with is the torque that the bus carries.
+CiA 402 drives report positions in encoder increments and take torques in per mille of the rated
+torque; the wall has radians and newton metres. The rounding that the bus imposes is applied only
+here, so the torque that the laws assume is the torque on the bus.
 """
 
 import math
@@ -18,9 +18,12 @@ MAX_PER_MILLE = 32767
 class DriveUnits:
     """Scales of one drive.
 
-    counts_per_rev: increments of 0x6064 per revolution of the shaft that carries the handle.
-    rated_torque_nm: torque at that shaft which 1000 of 0x6071 stands for.
-    Raises ValueError unless both are finite and positive.
+    Attributes:
+        counts_per_rev: Increments of 0x6064 per revolution of the shaft that carries the handle.
+        rated_torque_nm: Torque at that shaft for 1000 in 0x6071 [N·m].
+
+    Raises:
+        ValueError: Unless both are finite and positive.
     """
 
     counts_per_rev: float
@@ -45,19 +48,22 @@ class DriveUnits:
     def behind_gear(
         cls, counts_per_motor_rev: float, motor_rated_torque_nm: float, gear_ratio: float
     ) -> "DriveUnits":
-        """From the motor's scales (0x608F, 0x6076) and its turns per turn of the shaft (0x6091).
+        """Return the scales at the shaft behind a gear.
 
-        The encoder and the rated torque are the motor's; the handle is behind the gear.
+        Args:
+            counts_per_motor_rev: Increments per revolution of the motor (0x608F).
+            motor_rated_torque_nm: Rated torque of the motor (0x6076) [N·m].
+            gear_ratio: Revolutions of the motor per revolution of the shaft (0x6091).
         """
         return cls(counts_per_motor_rev * gear_ratio, motor_rated_torque_nm * gear_ratio)
 
 
 @compiled
 def to_per_mille(torque_nm: float, nm_per_mille: float, limit_nm: float) -> int:
-    """Torque as 0x6071 carries it: nearest step, none beyond ±limit, INTEGER16. NaN becomes 0."""
+    """Return a torque as 0x6071 carries it: the nearest step within ±limit_nm; 0 for NaN."""
     if not math.isfinite(torque_nm):
         return 0
-    # Limited before it is rounded: a torque far beyond what an integer holds keeps its sign.
+    # Limited before it is rounded, so that a torque beyond the range of an integer keeps its sign.
     largest = math.floor(min(limit_nm / nm_per_mille + 1e-9, float(MAX_PER_MILLE)))
     steps = min(max(torque_nm / nm_per_mille, -float(largest)), float(largest))
     return math.floor(steps + 0.5)

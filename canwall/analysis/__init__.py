@@ -1,19 +1,19 @@
-"""What a wall is judged by: metrics, the continuous referent, K-limits and analytic limits.
+"""Analysis of walls: metrics, the continuous referent, K-limits and analytic limits.
 
-Pure functions of arrays and numbers; runs, sweeps and the workbench call them, and so can you.
+Pure functions of arrays and numbers, for runs, sweeps, the workbench and your own scripts.
 """
 
-from canwall.analysis.k_limit import LIMITED, Strike, k_limits
+from canwall.analysis.k_limit import K_LIMIT, RepeatableStrike, k_limits
 from canwall.analysis.referent import ReferentInputs, follow_referent
-from canwall.analysis.strike import DESCRIBED, MEASURES, measure
+from canwall.analysis.strike import MEASURE_DESCRIPTIONS, MEASURES, measure_strike
 
 __all__ = [
-    "DESCRIBED",
-    "LIMITED",
+    "K_LIMIT",
     "MEASURES",
+    "MEASURE_DESCRIPTIONS",
     "ReferentInputs",
-    "Strike",
+    "RepeatableStrike",
     "follow_referent",
     "k_limits",
-    "measure",
+    "measure_strike",
 ]

@@ -1,7 +1,8 @@
-"""Analytic limits of the stiffness, to draw over every map (theory, section 6).
+"""Analytic limits of the stiffness, drawn over every map (theory, section 6).
 
-K and B are the wall's [N·m/rad, N·m·s/rad], b and m what really moves, T the period, D the delay
-from a sample to its torque in periods. B is made of the backward difference.
+K [N·m/rad] and B [N·m·s/rad] are the wall's stiffness and damping, m [kg·m²] and b [N·m·s/rad] the
+inertia and damping of everything that moves, T [s] is the sampling period, D the delay from a
+sample to its torque in periods. B acts on the backward difference of the position.
 """
 
 import math
@@ -11,19 +12,28 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: The largest K·T²/m of any spring-damper wall at b = 0, and the B·T/m of it, for D = 0, 1, 2.
+#: Largest K·T²/m of any spring-damper wall at b = 0, and its B·T/m, for D = 0, 1, 2.
 CEILINGS = {0: (0.686, 0.83), 1: (0.144, 0.43), 2: (0.062, 0.29)}
 
 
 def passive_stiffness(viscous: float, damping: float, period: float, delay: int) -> float:
-    """Colgate and Schenkel: the largest K that is passive whoever holds the handle.
+    """Return the largest K that is passive with any operator (Colgate and Schenkel).
 
-    b > K·T/2 + |B| without delay; its extension to D = 1. Raises ValueError for another D.
+    b > K·T/2 + |B| without delay, and its extension to D = 1.
+
+    Args:
+        viscous: Damping b of the device alone [N·m·s/rad].
+        damping: Damping B of the wall [N·m·s/rad].
+        period: Sampling period T [s].
+        delay: Delay D in periods, 0 or 1.
+
+    Raises:
+        ValueError: For another delay, for which there is no such limit.
     """
     if delay == 0:
         return max(0.0, 2.0 * (viscous - abs(damping)) / period)
     if delay != 1:
-        raise ValueError(f"there is no such limit for a delay of {delay} periods")
+        raise ValueError(f"no passivity limit for a delay of {delay} periods; it has to be 0 or 1")
     if viscous >= 5.0 * damping:
         return (viscous + damping) / (1.5 * period)
     if viscous <= damping:
@@ -33,21 +43,31 @@ def passive_stiffness(viscous: float, damping: float, period: float, delay: int)
 
 
 def quantised_stiffness(viscous: float, coulomb: float, count: float, period: float) -> float:
-    """Abbott and Okamura: K ≤ min(2·b/T, 2·f_c/Δ), passive with a quantised position, D = 0."""
+    """Return the largest K that is passive with a quantised position (Abbott and Okamura).
+
+    K ≤ min(2·b/T, 2·f_c/Δ), for D = 0 and B = 0.
+
+    Args:
+        viscous: Damping b of the device alone [N·m·s/rad].
+        coulomb: Coulomb friction f_c [N·m].
+        count: One encoder count Δ [rad].
+        period: Sampling period T [s].
+    """
     return min(2.0 * viscous / period, 2.0 * coulomb / count)
 
 
 def delayed_stiffness(viscous: float, damping: float, period: float, delay: float) -> float:
-    """Gil, Hulin: K < (b + B)/(T/2 + D·T), linear stability for small b·T/m."""
+    """Return the linear stability limit for small b·T/m: K < (b + B)/(T/2 + D·T) (Gil, Hulin)."""
     return (viscous + damping) / ((0.5 + delay) * period)
 
 
 def spectral_radius(
     mass: float, viscous: float, stiffness: float, damping: float, period: float, delay: int
 ) -> float:
-    """Largest modulus of the sampled loop's eigenvalues: stable below 1; exact, for whole D.
+    """Return the spectral radius of the sampled loop, which is stable below 1; exact.
 
-    f[j] = −K·y[j−D] − B·(y[j−D] − y[j−D−1])/T, held over the period that begins at j.
+    f[j] = −K·y[j−D] − B·(y[j−D] − y[j−D−1])/T is held over the period that begins at j; the delay
+    D is a whole number of periods.
     """
     ratio = viscous / mass
     decay = math.exp(-ratio * period)
@@ -57,7 +77,7 @@ def spectral_radius(
     else:
         travel, gamma_y = period, period * period / (2.0 * mass)
     gamma_v = travel / mass
-    # State: y, v, and y of the D + 1 samples before.
+    # State: y, v, and y at the D + 1 samples before.
     n = 3 + delay
     loop = np.zeros((n, n))
     loop[0, :2], loop[1, 1] = (1.0, travel), decay
@@ -76,22 +96,24 @@ def spectral_radius(
 def stable_stiffness(
     mass: float, viscous: float, damping: float, period: float, delay: int
 ) -> float:
-    """The largest K up to which the sampled loop is stable, to 1e-6 of it; 0 where none is."""
+    """Return the K up to which the sampled loop is stable, to a relative 1e-6; 0 if there is none.
 
-    def stable(normalised: float) -> bool:
+    Arguments as for `spectral_radius`.
+    """
+
+    def is_stable(normalised: float) -> bool:
         stiffness = normalised * mass / period**2
         return spectral_radius(mass, viscous, stiffness, damping, period, delay) < 1.0
 
-    ladder = np.geomspace(1e-6, 10.0, 400)
-    free, taken = 0.0, None
-    for normalised in ladder:
-        if not stable(normalised):
-            taken = float(normalised)
+    low, high = 0.0, None
+    for normalised in np.geomspace(1e-6, 10.0, 400):
+        if not is_stable(normalised):
+            high = float(normalised)
             break
-        free = float(normalised)
-    if free == 0.0 or taken is None:
-        return free * mass / period**2
-    while taken / free - 1.0 > 1e-6:
-        middle = math.sqrt(free * taken)
-        free, taken = (middle, taken) if stable(middle) else (free, middle)
-    return free * mass / period**2
+        low = float(normalised)
+    if low == 0.0 or high is None:
+        return low * mass / period**2
+    while high / low - 1.0 > 1e-6:
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if is_stable(middle) else (low, middle)
+    return low * mass / period**2

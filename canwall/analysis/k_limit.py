@@ -1,4 +1,4 @@
-"""The K-limit: the largest stiffness free of chatter (theory, section 5), by bisection in log K."""
+"""K-limit: the largest stiffness free of chatter (theory, section 5), by bisection in log K."""
 
 import functools
 import math
@@ -10,97 +10,108 @@ from numpy.typing import NDArray
 
 from canwall.analysis.strike import MEASURES
 
-#: Where the search begins and between what it stays: K·T²/m.
+#: Start and bounds of the search, as K·T²/m.
 FIRST, SMALLEST, LARGEST = 1.0 / 512.0, 1e-5, 4.0
-#: Width in log K at which a bracket is narrow enough.
+#: Width of the final bracket in log K.
 RESOLUTION = 0.01
 
-#: One strike of a search: its own limit, whether that is but the end of the search, the worst
-#: limit of all strikes [N·m/rad], and what is measured of the strike there (zero stiffness: NaN).
-LIMITED = np.dtype(
+#: One strike of a search: its own K-limit [N·m/rad]; whether that is only the end of the search;
+#: the worst K-limit of all strikes [N·m/rad]; MEASURES of the strike at the worst (NaN if it is 0).
+K_LIMIT = np.dtype(
     [("limit", "f8"), ("open_ended", "?"), ("worst", "f8"), *MEASURES.descr], align=True
 )
 
 
-class Strike(Protocol):
+class RepeatableStrike(Protocol):
     """A strike that can be repeated on one wall after another."""
 
     @property
     def mass(self) -> float:
-        """Inertia of what really moves [kg·m²]."""
+        """Inertia of everything that moves [kg·m²]."""
         ...
 
     @property
     def period(self) -> float:
-        """T [s]."""
+        """Sampling period T [s]."""
         ...
 
     def on(self, stiffness: float, damping: float) -> np.void:
-        """Measure it on a wall of that stiffness [N·m/rad] and damping; dtype MEASURES."""
+        """Strike a wall of this stiffness [N·m/rad] and damping [N·m·s/rad]; dtype MEASURES."""
         ...
 
 
-def k_limits(strikes: Sequence[Strike], damping: float) -> NDArray[np.void]:
-    """Limits of all strikes on a wall of that damping [N·m·s/rad]; shape (n,), dtype LIMITED.
+def k_limits(strikes: Sequence[RepeatableStrike], damping: float) -> NDArray[np.void]:
+    """Search the K-limit of each strike, and a stiffness at which none of them chatters.
 
-    The worst is free of chatter for every one of them, not only the least of their limits.
+    The worst K-limit may be below the smallest limit of a single strike: a strike that is free of
+    chatter at its own limit may chatter below it.
+
+    Args:
+        strikes: Strikes with the same mass and period.
+        damping: Damping of the wall [N·m·s/rad].
+
+    Returns:
+        Limits and measures of each strike, shape (n,), dtype K_LIMIT.
     """
-    found = np.zeros(len(strikes), LIMITED)
+    limits = np.zeros(len(strikes), K_LIMIT)
     unit = strikes[0].mass / strikes[0].period ** 2
     for i, strike in enumerate(strikes):
-        free, taken = bracket(functools.partial(_is_free, strike, unit, damping))
-        found["limit"][i], found["open_ended"][i] = free * unit, math.isinf(taken)
-    worst = found["limit"].min()
+        free, chatters = bracket(functools.partial(_is_free, strike, unit, damping))
+        limits["limit"][i], limits["open_ended"][i] = free * unit, math.isinf(chatters)
+    worst = limits["limit"].min()
     while worst > 0.0:
-        measured = [strike.on(worst, damping) for strike in strikes]
-        if not any(m["chatters"] for m in measured):
+        measures = [strike.on(worst, damping) for strike in strikes]
+        if not any(m["chatters"] for m in measures):
             for name in MEASURES.names or ():
-                found[name] = [m[name] for m in measured]
+                limits[name] = [m[name] for m in measures]
             break
-        # Free at its own limit, a strike may chatter below it.
         worst *= math.exp(-RESOLUTION)
         if worst < SMALLEST * unit:
             worst = 0.0
     if worst == 0.0:
         for name in MEASURES.names or ():
-            found[name] = math.nan if MEASURES[name].kind == "f" else 0
-    found["worst"] = worst
-    return found
+            limits[name] = math.nan if MEASURES[name].kind == "f" else 0
+    limits["worst"] = worst
+    return limits
 
 
-def _is_free(strike: Strike, unit: float, damping: float, normalised: float) -> bool:
+def _is_free(strike: RepeatableStrike, unit: float, damping: float, normalised: float) -> bool:
     return not strike.on(normalised * unit, damping)["chatters"]
 
 
 def bracket(is_free: Callable[[float], bool]) -> tuple[float, float]:
-    """(the largest that is free, one that is not) no further apart than RESOLUTION in the log.
+    """Bracket the largest K·T²/m that is free of chatter to RESOLUTION in its logarithm.
 
-    Goes up by factors of two from FIRST until one is not free. Where the first is not, goes down;
-    and where none is down there (a soft wall may be too soft to hold the hand), up to one that
-    is. (0, …) where none is free at all, (…, inf) where all are from there to LARGEST.
+    Doubles from FIRST until a value chatters. If FIRST itself chatters, halves until a value is
+    free; if none is (a very soft wall may fail to hold the hand), doubles until one is.
+
+    Returns:
+        The largest free value, 0 if there is none, and the next that chatters, infinity if all do
+        not up to LARGEST.
     """
-    steps = math.floor(math.log2(LARGEST / FIRST))
-    up = [FIRST * 2.0**n for n in range(steps + 1)]
-    down = [FIRST * 0.5**n for n in range(1, math.floor(math.log2(FIRST / SMALLEST)) + 1)]
-    free, taken = 0.0, math.inf
+    doublings = math.floor(math.log2(LARGEST / FIRST))
+    halvings = math.floor(math.log2(FIRST / SMALLEST))
+    up = [FIRST * 2.0**n for n in range(doublings + 1)]
+    down = [FIRST * 0.5**n for n in range(1, halvings + 1)]
+    free, chatters = 0.0, math.inf
     if not is_free(up[0]):
-        taken = up.pop(0)
-        for at in down:
-            if is_free(at):
-                free = at
+        chatters = up.pop(0)
+        for value in down:
+            if is_free(value):
+                free = value
                 break
-            taken = at
+            chatters = value
     if free == 0.0:
-        for at in up:
-            if is_free(at):
-                free, taken = at, math.inf
+        for value in up:
+            if is_free(value):
+                free, chatters = value, math.inf
             elif free > 0.0:
-                taken = at
+                chatters = value
                 break
-    while free > 0.0 and math.isfinite(taken) and math.log(taken / free) >= RESOLUTION:
-        at = math.sqrt(free * taken)
-        if is_free(at):
-            free = at
+    while free > 0.0 and math.isfinite(chatters) and math.log(chatters / free) >= RESOLUTION:
+        middle = math.sqrt(free * chatters)
+        if is_free(middle):
+            free = middle
         else:
-            taken = at
-    return free, taken
+            chatters = middle
+    return free, chatters

@@ -1,7 +1,7 @@
-"""What is measured of a wall: one definition each, used by summaries, sweeps and figures.
+"""Metrics of a wall (theory, section 5): energy, contacts, strikes and chatter.
 
-Positions y are relative to the wall (y < 0 inside) at the SYNCs, forces f are those held from
-each SYNC to the next, positive out of the wall. See theory, section 5.
+Positions y are relative to the wall at each SYNC, y < 0 inside. Forces f are held from each SYNC
+to the next, positive out of the wall. Units: rad and N·m, or m and N.
 """
 
 from dataclasses import dataclass
@@ -15,19 +15,25 @@ Array = NDArray[np.float64]
 
 #: Contacts that follow one another within this time belong to one strike of the hand [s].
 STRIKE_GAP_S = 0.2
-#: Make and break events are counted within this time; that many more than the referent's are
-#: chatter.
+#: Window in which makes and breaks of contact are counted [s].
 EVENT_WINDOW_S = 0.2
+#: Makes and breaks in a window, beyond the referent's, from which on a wall chatters.
 EVENTS_OF_CHATTER = 3
-#: The shortest stretch over which a settled position is judged [s].
+#: Shortest stretch over which a settled position is judged [s].
 SETTLED_S = 0.05
 
 
 def energy_out(y: Array, force: Array) -> Array:
-    """Running energy W[j] = Σ f·(y[j+1] − y[j]) that the wall has put out [J]; shape (n,).
+    """Return the energy that the wall has put out up to each SYNC: W[j] = Σ f·(y[j+1] − y[j]).
 
-    Exact, because f is held over each interval. y and force have shape (n,); W[0] = 0. A passive
-    wall never exceeds 0.
+    The sum is exact, because f is held over each interval. A passive wall never exceeds 0.
+
+    Args:
+        y: Positions relative to the wall, shape (n,).
+        force: Held forces, shape (n,).
+
+    Returns:
+        Energy [J], shape (n,), W[0] = 0.
     """
     work = np.zeros(len(y))
     np.cumsum(force[:-1] * np.diff(y), out=work[1:])
@@ -35,10 +41,14 @@ def energy_out(y: Array, force: Array) -> Array:
 
 
 def contacts(y: Array, force: Array) -> list[slice]:
-    """The contacts as slices of cycles: inside the wall, or outside with its force still held.
+    """Return the contacts as slices of cycles.
 
-    A slice runs from the first such cycle up to and with the first cycle after it, so that the
-    energy over it is complete.
+    The handle is in contact while it is inside the wall, or outside with a force still held. A
+    slice includes the first cycle after the contact, so that the energy over it is complete.
+
+    Args:
+        y: Positions relative to the wall, shape (n,).
+        force: Held forces, shape (n,).
     """
     touching = np.concatenate([[False], (y < 0.0) | (force != 0.0), [False]])
     edges = np.flatnonzero(np.diff(touching.astype(np.int8)))
@@ -50,7 +60,7 @@ def contacts(y: Array, force: Array) -> list[slice]:
 
 @dataclass(frozen=True)
 class StrikeContacts:
-    """Contacts that belong together: one strike of the hand on the wall."""
+    """Contacts of one strike of the hand on the wall."""
 
     cycles: slice
     contacts: tuple[slice, ...]
@@ -59,9 +69,12 @@ class StrikeContacts:
 def strikes(
     touched: list[slice], cycle_s: float, boundaries: Array | None = None
 ) -> list[StrikeContacts]:
-    """Group contacts into strikes: a gap of STRIKE_GAP_S, or a boundary, begins a new one.
+    """Group contacts into strikes: a gap of STRIKE_GAP_S or a boundary begins a new one.
 
-    `boundaries` are cycles at which the wall was changed, e.g. its law exchanged.
+    Args:
+        touched: Contacts in order, as from `contacts`.
+        cycle_s: Period of the SYNC [s].
+        boundaries: Cycles at which the wall changed, for example its law.
     """
     gap = STRIKE_GAP_S / cycle_s
     cuts = np.asarray([] if boundaries is None else boundaries)
@@ -77,7 +90,7 @@ def strikes(
 
 @dataclass(frozen=True)
 class Chatter:
-    """Whether a wall chattered, and what says so."""
+    """Verdict on a strike: whether the wall chattered, and the reason in words."""
 
     chatters: bool
     reason: str
@@ -85,25 +98,31 @@ class Chatter:
 
 @compiled
 def amplitude_tolerance(stiffness: float, count: float, force_step: float) -> float:
-    """Motion that quantisation alone explains: max(6·Δ, 3·f_LSB/K) [rad or m]."""
+    """Return the motion that quantisation alone explains: max(6·Δ, 3·f_LSB/K) [rad or m]."""
     return max(6.0 * count, 3.0 * force_step / stiffness if stiffness > 0.0 else 0.0)
 
 
 def chatter(
     y: Array, referent: Array | None, cycle_s: float, tolerance: float, count: float
 ) -> Chatter:
-    """Judge one strike: y and the continuous referent's positions over its cycles, shape (n,).
+    """Judge whether a wall chattered in one strike.
 
-    count is one encoder count, tolerance `amplitude_tolerance` [both as y].
-    Chatter is motion about the settled contact by more than `tolerance` beyond the referent's
-    own, or EVENTS_OF_CHATTER makes and breaks within EVENT_WINDOW_S that the referent does not
-    make. Without a referent (a person at the handle) only the events can be judged.
+    Chatter is motion about the settled contact that exceeds the referent's by more than
+    `tolerance`, or EVENTS_OF_CHATTER more makes and breaks of contact within EVENT_WINDOW_S than
+    the referent has. Without a referent (a person at the handle) only the events are judged.
+
+    Args:
+        y: Positions relative to the wall over the strike, shape (n,).
+        referent: Positions of the continuous referent, shape (n,), or None.
+        cycle_s: Period of the SYNC [s].
+        tolerance: `amplitude_tolerance`, in the unit of y.
+        count: One encoder count, in the unit of y.
     """
-    # A wall that loses some energy bounces as its referent does, only earlier: it is the busiest
-    # window of each that is compared, not window by window.
+    # The busiest window of each is compared, not window by window: a wall that loses some energy
+    # bounces as its referent does, only earlier.
     window = event_window(cycle_s)
-    events = most_events(y, window, count)
-    expected = 0 if referent is None else most_events(referent, window, count)
+    events = busiest_window(y, window, count)
+    expected = 0 if referent is None else busiest_window(referent, window, count)
     if events - expected >= EVENTS_OF_CHATTER:
         compared = "without a referent" if referent is None else f"the referent {expected}"
         return Chatter(
@@ -112,7 +131,7 @@ def chatter(
         )
     if referent is None:
         return Chatter(False, "too few makes and breaks; amplitude not judged without a referent")
-    start, stop = rest_of(referent, tolerance, cycle_s)
+    start, stop = settled_window(referent, tolerance, cycle_s)
     if start == stop:
         return Chatter(False, "the referent never settles; amplitude not judged")
     measured, own = peak_to_peak(y[start:stop]), peak_to_peak(referent[start:stop])
@@ -122,16 +141,16 @@ def chatter(
 
 @compiled
 def event_window(cycle_s: float) -> int:
-    """EVENT_WINDOW_S in cycles."""
+    """Return EVENT_WINDOW_S in cycles."""
     return max(1, round(EVENT_WINDOW_S / cycle_s))
 
 
 @compiled
-def most_events(y: Array, window: int, count: float) -> int:
-    """The most makes and breaks of contact within any window of cycles.
+def busiest_window(y: Array, window: int, count: float) -> int:
+    """Return the largest number of makes and breaks of contact in any `window` cycles.
 
-    Contact is made below 0 and broken above one count: to and fro between two counts at the
-    surface, as the last bit of a resting encoder may go, is neither.
+    Contact is made below 0 and broken above one count, so the last bit of an encoder at rest on
+    the surface does not count.
     """
     changed = np.zeros(len(y), np.bool_)
     side = within = most = 0
@@ -148,7 +167,11 @@ def most_events(y: Array, window: int, count: float) -> int:
 
 
 @compiled
-def _settled(referent: Array, tolerance: float) -> tuple[int, int]:
+def settled_stretch(referent: Array, tolerance: float) -> tuple[int, int]:
+    """Return the longest stretch inside the wall over which the referent stays within `tolerance`.
+
+    As its first cycle and the one after its last.
+    """
     best_start = best_stop = start = 0
     low, high = np.inf, -np.inf
     for j in range(len(referent)):
@@ -157,7 +180,7 @@ def _settled(referent: Array, tolerance: float) -> tuple[int, int]:
         if position >= 0.0:
             start, low, high = j + 1, np.inf, -np.inf
         elif high - low > tolerance:
-            # Begin anew after the last position that is too far from this one.
+            # Start again after the last position that is too far from this one.
             low = high = position
             start = j
             while abs(referent[start - 1] - position) <= tolerance:
@@ -168,20 +191,15 @@ def _settled(referent: Array, tolerance: float) -> tuple[int, int]:
     return best_start, best_stop
 
 
-def settled_stretch(referent: Array, tolerance: float) -> slice:
-    """The longest stretch, inside the wall, over which the referent stays within `tolerance`."""
-    return slice(*_settled(referent, tolerance))
-
-
 @compiled
-def rest_of(referent: Array, tolerance: float, cycle_s: float) -> tuple[int, int]:
-    """First cycle, and the one after the last, over which a settled contact is judged.
+def settled_window(referent: Array, tolerance: float, cycle_s: float) -> tuple[int, int]:
+    """Return the window in which the motion about a settled contact is judged.
 
-    (0, 0) where the referent settles for less than SETTLED_S. The wall may come to rest somewhat
-    later than the referent, and leave its rest somewhat before it: what lasts is judged, over the
-    middle of the stretch.
+    It is the middle of the settled stretch: the wall may come to rest later than the referent and
+    leave its rest earlier. As its first cycle and the one after its last; (0, 0) if the referent
+    settles for less than SETTLED_S.
     """
-    start, stop = _settled(referent, tolerance)
+    start, stop = settled_stretch(referent, tolerance)
     length = stop - start
     if length * cycle_s < SETTLED_S:
         return 0, 0
@@ -190,7 +208,7 @@ def rest_of(referent: Array, tolerance: float, cycle_s: float) -> tuple[int, int
 
 @compiled
 def peak_to_peak(y: Array) -> float:
-    """Largest less smallest; 0 of nothing."""
+    """Return the largest value minus the smallest; 0 for an empty array."""
     if len(y) == 0:
         return 0.0
     low = high = y[0]
@@ -201,7 +219,7 @@ def peak_to_peak(y: Array) -> float:
 
 @compiled
 def limit_cycle(y: Array, cycle_s: float) -> tuple[float, float]:
-    """Amplitude (half peak to peak) and frequency [Hz] (upward crossings of the mean) of y."""
+    """Return amplitude (half peak to peak) and frequency [Hz] (crossings of the mean) of y."""
     if len(y) < 2:
         return 0.0, 0.0
     mean = y.mean()

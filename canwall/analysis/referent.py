@@ -1,4 +1,4 @@
-"""The continuous referent of a run: the same hand on the same handle, against an ideal wall."""
+"""Continuous referent of a run: the same hand on the same handle, against an ideal wall."""
 
 from typing import NamedTuple
 
@@ -14,7 +14,19 @@ _NO_MOTOR = Force(0.0, 0.0, 0.0, 0.0)
 
 
 class ReferentInputs(NamedTuple):
-    """Hand and handle as compiled code takes them; origin, pull and slope for each cycle, (n,)."""
+    """Hand and handle in the form that compiled code takes.
+
+    Attributes:
+        handle: Plant of the handle alone, shape (1,), dtype PLANT.
+        joined: Plant of handle and hand moving as one, shape (1,), dtype PLANT.
+        body: The hand as a body of its own.
+        grip: True if the hand cannot lose the handle.
+        origin: Position of the wall in each cycle [rad], shape (n,).
+        pull: Force of the hand's script at each SYNC [N·m], shape (n,).
+        slope: Slope of that force over the cycle [N·m/s], shape (n,).
+        period: Period of the SYNC [s].
+        rest: Position at which the hand rests at the start [rad].
+    """
 
     handle: NDArray[np.void]
     joined: NDArray[np.void]
@@ -28,45 +40,52 @@ class ReferentInputs(NamedTuple):
 
 
 @compiled
-def follow_referent(of: ReferentInputs, stiffness: Array, damping: Array, y: Array) -> None:
-    """Fill y, shape (n,), with the referent's positions relative to the wall, as at each SYNC."""
-    y[0] = of.rest - of.origin[0]
-    if of.grip:
-        _follow(of, stiffness, damping, y)
+def follow_referent(inputs: ReferentInputs, stiffness: Array, damping: Array, y: Array) -> None:
+    """Fill y with the positions of the continuous referent at each SYNC, relative to the wall.
+
+    Args:
+        inputs: Hand and handle.
+        stiffness: Stiffness of the wall in each cycle [N·m/rad], shape (n,).
+        damping: Damping of the wall in each cycle [N·m·s/rad], shape (n,).
+        y: Result [rad], shape (n,).
+    """
+    y[0] = inputs.rest - inputs.origin[0]
+    if inputs.grip:
+        _follow_joined(inputs, stiffness, damping, y)
     else:
-        _follow_apart(of, stiffness, damping, y)
+        _follow_grasp(inputs, stiffness, damping, y)
 
 
 @compiled
-def _meet(plant: Record, stiffness: float, damping: float, origin: float) -> None:
-    """Set the wall that a plant meets, its position measured from there."""
+def _set_wall(plant: Record, stiffness: float, damping: float, origin: float) -> None:
+    """Set the wall of a plant whose position is measured from it."""
     plant.wall_stiffness = stiffness
     plant.wall_damping = damping
     plant.cog_origin = origin
 
 
 @compiled
-def _follow(of: ReferentInputs, stiffness: Array, damping: Array, y: Array) -> None:
-    """Fill y from its first value on, starting at rest."""
-    plant: Record = of.joined[0]
+def _follow_joined(inputs: ReferentInputs, stiffness: Array, damping: Array, y: Array) -> None:
+    """Fill y from y[0] on, starting at rest, with a hand that cannot lose the handle."""
+    plant: Record = inputs.joined[0]
     v = 0.0
     for j in range(len(y) - 1):
-        _meet(plant, stiffness[j], damping[j], of.origin[j])
-        y_next, v, _ = advance(plant, y[j], v, of.pull[j], of.slope[j], of.period)
-        y[j + 1] = y_next + of.origin[j] - of.origin[j + 1]
+        _set_wall(plant, stiffness[j], damping[j], inputs.origin[j])
+        y_next, v, _ = advance(plant, y[j], v, inputs.pull[j], inputs.slope[j], inputs.period)
+        y[j + 1] = y_next + inputs.origin[j] - inputs.origin[j + 1]
 
 
 @compiled
-def _follow_apart(of: ReferentInputs, stiffness: Array, damping: Array, y: Array) -> None:
-    """Fill y from its first value on, starting at rest, with a hand that can lose the handle."""
-    handle: Record = of.handle[0]
-    joined: Record = of.joined[0]
+def _follow_grasp(inputs: ReferentInputs, stiffness: Array, damping: Array, y: Array) -> None:
+    """Fill y from y[0] on, starting at rest, with a hand that can lose the handle."""
+    handle: Record = inputs.handle[0]
+    joined: Record = inputs.joined[0]
     now = Grasp(y[0], 0.0, y[0], 0.0, True)
     for j in range(len(y) - 1):
-        _meet(handle, stiffness[j], damping[j], of.origin[j])
-        _meet(joined, stiffness[j], damping[j], of.origin[j])
-        script = Force(of.pull[j], of.slope[j], 0.0, 0.0)
-        now = advance_grasp(handle, joined, of.body, now, _NO_MOTOR, script, of.period)
-        shift = of.origin[j] - of.origin[j + 1]
+        _set_wall(handle, stiffness[j], damping[j], inputs.origin[j])
+        _set_wall(joined, stiffness[j], damping[j], inputs.origin[j])
+        script = Force(inputs.pull[j], inputs.slope[j], 0.0, 0.0)
+        now = advance_grasp(handle, joined, inputs.body, now, _NO_MOTOR, script, inputs.period)
+        shift = inputs.origin[j] - inputs.origin[j + 1]
         now = Grasp(now.y + shift, now.v, now.hand_y + shift, now.hand_v, now.touching)
         y[j + 1] = now.y

@@ -1,4 +1,4 @@
-"""What is found at one point of a sweep: the metrics of theory, section 5, of one strike."""
+"""Measures of one strike: the metrics of theory, section 5, at one point of a sweep."""
 
 import math
 
@@ -10,39 +10,39 @@ from canwall.compiled import Record, compiled
 
 Array = NDArray[np.float64]
 
-#: One strike, judged. What cannot be told is NaN.
+#: Measures of one strike, described in MEASURE_DESCRIPTIONS. What cannot be measured is NaN.
 MEASURES = np.dtype(
     [
-        ("chatters", "?"),  # or threw the handle away
-        ("settled", "?"),  # whether the referent settles, so that the amplitude can be judged
-        ("trip", "i1"),  # cycle.Trip
+        ("chatters", "?"),
+        ("settled", "?"),
+        ("trip", "i1"),
         ("contacts", "i4"),
-        ("events", "i4"),  # makes and breaks in the busiest 200 ms
+        ("events", "i4"),
         ("referent_events", "i4"),
-        ("motion", "f8"),  # peak to peak about the settled contact
+        ("motion", "f8"),
         ("referent_motion", "f8"),
-        ("tolerance", "f8"),  # of that motion: what quantisation explains
-        ("amplitude", "f8"),  # half peak to peak of the chatter
-        ("frequency", "f8"),  # of the chatter
-        ("energy_out", "f8"),  # the most that the wall had put out at any time
-        ("energy_end", "f8"),  # signed area of the hysteresis loop: what it had put out at the end
-        ("energy_tolerance", "f8"),  # one count times the peak torque
+        ("tolerance", "f8"),
+        ("amplitude", "f8"),
+        ("frequency", "f8"),
+        ("energy_out", "f8"),
+        ("energy_end", "f8"),
+        ("energy_tolerance", "f8"),
         ("peak_torque", "f8"),
         ("penetration", "f8"),
         ("rate_hardness", "f8"),
-        ("restitution", "f8"),  # of the first contact
+        ("restitution", "f8"),
         ("referent_restitution", "f8"),
     ],
     align=True,
 )
 
-#: (unit, what it is) of the measures that are numbers.
-DESCRIBED = {
+#: (unit, description) of each of the MEASURES.
+MEASURE_DESCRIPTIONS = {
     "chatters": (
         "1",
-        "chatter by theory, section 5, or a trip where the referent stays within the limits",
+        "chatter by theory, section 5, or a trip while the referent stays within the limits",
     ),
-    "settled": ("1", "the referent settles, so that the amplitude is judged"),
+    "settled": ("1", "the referent settles, so that the amplitude can be judged"),
     "trip": ("1", "the limit that ended the strike (cycle.Trip), 0: none"),
     "contacts": ("1", "contacts of the strike"),
     "events": ("1", "makes and breaks of contact within the busiest 200 ms"),
@@ -62,12 +62,12 @@ DESCRIBED = {
     "referent_restitution": ("1", "the same of the continuous referent"),
 }
 
-#: Samples over which a speed before or after a contact, and the rise of the force, are taken.
+#: Samples over which speeds before and after a contact, and the rise of the force, are averaged.
 _SPAN = 5
 
 
 @compiled
-def measure(
+def measure_strike(
     y: Array,
     force: Array,
     torque: Array,
@@ -78,21 +78,31 @@ def measure(
     count: float,
     torque_step: float,
     stiffness: float,
-    found: NDArray[np.void],
+    measures: NDArray[np.void],
 ) -> None:
-    """Judge one strike into found[0], dtype MEASURES.
+    """Measure one strike.
 
-    y, force, torque and referent have shape (n,); thrown says that a trip is the wall's doing,
-    its referent's would have stayed within the limits; count is Δ [rad], torque_step f_LSB [N·m].
+    Args:
+        y: Positions relative to the wall at each SYNC [rad], shape (n,).
+        force: Forces held from each SYNC on, out of the wall [N·m], shape (n,).
+        torque: Commanded torques [N·m], shape (n,).
+        trip: The limit that ended the strike, 0 for none.
+        thrown: True if the wall threw the handle beyond limits that the referent keeps.
+        referent: Positions of the continuous referent [rad], shape (n,).
+        period: Period of the SYNC [s].
+        count: One encoder count Δ [rad].
+        torque_step: One step of torque f_LSB [N·m].
+        stiffness: Stiffness of the wall [N·m/rad].
+        measures: Result, shape (1,), dtype MEASURES.
     """
-    into: Record = found[0]
+    into: Record = measures[0]
     window = metrics.event_window(period)
     tolerance = metrics.amplitude_tolerance(stiffness, count, torque_step)
     into.trip = trip
     into.tolerance = tolerance
-    into.events = metrics.most_events(y, window, count)
-    into.referent_events = metrics.most_events(referent, window, count)
-    start, stop = metrics.rest_of(referent, tolerance, period)
+    into.events = metrics.busiest_window(y, window, count)
+    into.referent_events = metrics.busiest_window(referent, window, count)
+    start, stop = metrics.settled_window(referent, tolerance, period)
     into.settled = stop > start
     into.motion = metrics.peak_to_peak(y[start:stop])
     into.referent_motion = metrics.peak_to_peak(referent[start:stop])
@@ -101,26 +111,29 @@ def measure(
         or into.events - into.referent_events >= metrics.EVENTS_OF_CHATTER
         or into.motion - into.referent_motion > tolerance
     )
-    first, after, contacts = _contacts(y, force)
+    first, after, contacts = _count_contacts(y, force)
     into.contacts = contacts
     into.amplitude = into.frequency = 0.0
     if into.chatters:
         cycle = y[start:stop] if stop > start else y[first:after]
         into.amplitude, into.frequency = metrics.limit_cycle(cycle, period)
-    _energies(into, y, force)
+    _integrate_energy(into, y, force)
     into.peak_torque = np.abs(torque).max() if len(torque) else 0.0
     into.energy_tolerance = count * into.peak_torque
     into.penetration = max(-y.min(), 0.0) if len(y) else 0.0
-    speed, into.restitution = _bounce(y, period)
-    _, into.referent_restitution = _bounce(referent, period)
+    speed, into.restitution = _first_bounce(y, period)
+    _, into.referent_restitution = _first_bounce(referent, period)
     into.rate_hardness = math.nan
     if speed < 0.0 and first + _SPAN < len(force):
         into.rate_hardness = -(force[first + _SPAN] - force[first]) / (_SPAN * period) / speed
 
 
 @compiled
-def _contacts(y: Array, force: Array) -> tuple[int, int, int]:
-    """First cycle of contact, the one after the last, and how many contacts (`metrics`)."""
+def _count_contacts(y: Array, force: Array) -> tuple[int, int, int]:
+    """Return the first cycle of contact, the one after the last, and the number of contacts.
+
+    Contact is defined as in `metrics.contacts`.
+    """
     first = after = contacts = 0
     touching = False
     for j in range(len(y)):
@@ -134,8 +147,8 @@ def _contacts(y: Array, force: Array) -> tuple[int, int, int]:
 
 
 @compiled
-def _energies(into: Record, y: Array, force: Array) -> None:
-    """Running energy out, as `metrics.energy_out`: its largest and its last."""
+def _integrate_energy(into: Record, y: Array, force: Array) -> None:
+    """Store the largest and the last value of `metrics.energy_out`, without the array."""
     work = most = 0.0
     for j in range(len(y) - 1):
         work += force[j] * (y[j + 1] - y[j])
@@ -144,10 +157,10 @@ def _energies(into: Record, y: Array, force: Array) -> None:
 
 
 @compiled
-def _bounce(y: Array, period: float) -> tuple[float, float]:
-    """Speed at the first contact, and how much of it is left at its end; NaN where there is none.
+def _first_bounce(y: Array, period: float) -> tuple[float, float]:
+    """Return the speed into the first contact and the restitution; NaN if there is none.
 
-    Mean speeds over the samples before the contact and after it.
+    Speeds are means over the _SPAN samples before the contact and after it.
     """
     enter = 0
     while enter < len(y) and y[enter] >= 0.0:

@@ -1,4 +1,4 @@
-"""What is found out about a bench before and beside a run."""
+"""Examination of a bench: the doctor, the bus budget, and the latency of the cycle."""
 
 from canwall.bench.doctor import Finding, Findings, examine
 from canwall.bench.latency import Latency, measure_latency

@@ -1,27 +1,31 @@
-"""The bus's budget: what the frames of one cycle take of it, and the highest rate that fits.
+"""Bus budget: the share of the bus that the frames of a cycle take, and the highest rate that fits.
 
-A classical frame with an 11-bit identifier and n bytes of data takes 47 + 8n bits with the
-interframe space, and at worst ⌊(34 + 8n − 1)/4⌋ stuff bits (ISO 11898-1; Davis, Burns, Bril and
-Lukkien 2007). At best it has none.
+A classical frame with an 11-bit identifier and n bytes of data has 47 + 8n bits with the
+interframe space, and up to ⌊(34 + 8n − 1)/4⌋ stuff bits (ISO 11898-1; Davis, Burns, Bril and
+Lukkien 2007).
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-#: The part of a cycle that may be used: SDO, EMCY, heartbeats and a retransmission need the rest.
+from canwall.config import Bus as BusSettings
+from canwall.drive import DriveNode, DriveSetup
+from canwall.drive.pdo import tpdos_on_sync
+
+#: Usable share of a cycle: SDO, EMCY, heartbeats and a retransmission need the rest.
 USABLE = 0.8
 
 
 def frame_bits(length: int, stuffed: bool = True) -> int:
-    """Bits of a frame with `length` bytes of data, with the most stuff bits or with none."""
+    """Return the bits of a frame with `length` data bytes, with the most stuff bits or none."""
     stuff = (34 + 8 * length - 1) // 4 if stuffed else 0
     return 47 + 8 * length + stuff
 
 
 @dataclass(frozen=True)
 class BudgetFrame:
-    """A frame that comes once per cycle."""
+    """A frame that is sent once per cycle; length is that of its data in bytes."""
 
     name: str
     can_id: int
@@ -32,8 +36,13 @@ class BudgetFrame:
 class BudgetLine:
     """One frame of the budget.
 
-    earliest_s, latest_s: its end after the beginning of the SYNC, the bus being free of all else
-    but one frame of the greatest length, that had begun before [s].
+    Attributes:
+        frame: The frame.
+        bits: Its bits with the most stuff bits.
+        share: Its share of the cycle.
+        earliest_s: Earliest end after the start of the SYNC [s].
+        latest_s: Latest end [s], if the bus is busy with a frame of the greatest length at the
+            start and carries nothing else.
     """
 
     frame: BudgetFrame
@@ -45,7 +54,14 @@ class BudgetLine:
 
 @dataclass(frozen=True)
 class Budget:
-    """What a cycle takes."""
+    """Budget of a cycle.
+
+    Attributes:
+        lines: Its frames, in the order in which they are sent.
+        bits: Bits of a cycle with the most stuff bits.
+        share: Share of the cycle that they take.
+        highest_hz: Highest rate of the SYNC that fits [Hz].
+    """
 
     lines: tuple[BudgetLine, ...]
     bits: int
@@ -54,8 +70,22 @@ class Budget:
 
     @property
     def fits(self) -> bool:
-        """Whether the cycle leaves room for everything else."""
+        """True if the cycle leaves room for all other frames."""
         return self.share <= USABLE
+
+
+def cycle_budget(node: DriveNode, setup: DriveSetup, bus: BusSettings) -> Budget:
+    """Return the budget of a drive that is set up: SYNC, all TPDOs that follow it, and the RPDO.
+
+    Raises DriveError.
+    """
+    return bus_budget(
+        BudgetFrame("SYNC", setup.sync_cob_id, 1 if setup.sync_counter_overflow else 0),
+        [BudgetFrame("TPDO", tpdo.cob_id, tpdo.length) for tpdo in tpdos_on_sync(node)],
+        [BudgetFrame("RPDO", setup.rpdo.cob_id, setup.rpdo.length)],
+        bus.bitrate,
+        bus.cycle_s,
+    )
 
 
 def bus_budget(
@@ -65,11 +95,17 @@ def bus_budget(
     bitrate: int,
     cycle_s: float,
 ) -> Budget:
-    """The budget of a SYNC, the TPDOs that answer it, and the RPDOs that follow.
+    """Return the budget of a SYNC, the TPDOs that answer it, and the RPDOs that follow.
 
-    TPDOs and RPDOs go over the bus in the order of their identifiers, lowest first: that is what
-    arbitration makes of frames that are ready together. Times are those of the bus alone; drives
-    and master add their own.
+    TPDOs and RPDOs are sent in the order of their identifiers, lowest first, as arbitration does
+    with frames that are ready together. Drives and master add their own times to those of the bus.
+
+    Args:
+        sync: SYNC.
+        tpdos: TPDOs sent with it.
+        rpdos: RPDOs of the cycle.
+        bitrate: Bit rate [bit/s].
+        cycle_s: Period of the SYNC [s].
     """
     frames = [sync, *_by_priority(tpdos), *_by_priority(rpdos)]
     blocking = frame_bits(8) / bitrate
@@ -81,7 +117,7 @@ def bus_budget(
         share = bits / bitrate / cycle_s
         lines.append(BudgetLine(frame, bits, share, best / bitrate, blocking + worst / bitrate))
     highest = USABLE * bitrate / worst
-    # Rounded down: a rate that is said to fit, fits.
+    # Rounded down, so that the rate really fits.
     return Budget(tuple(lines), worst, worst / bitrate / cycle_s, math.floor(highest))
 
 

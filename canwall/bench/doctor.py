@@ -11,7 +11,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 
 from canwall.bench.budget import USABLE, BudgetFrame, bus_budget
-from canwall.bench.latency import measured_settings
+from canwall.bench.latency import measurement_settings
 from canwall.config import Settings
 from canwall.cycle import Exchange, Loop, WallAxis, WallGivenUpError, run_laws
 from canwall.drive import DriveError, DriveNode, DriveSetup, Link, PdoLayout, disable, set_up
@@ -67,7 +67,7 @@ def examine(
     Whatever happens, torque is zero, the drive is disabled and put back at the end. Raises
     DriveError where the drive cannot be set up or does not follow, can.CanError.
     """
-    settings = measured_settings(settings)
+    settings = measurement_settings(settings)
     dictionary = load_eds(settings.drive.eds, settings.drive.node_id, required)
     node = DriveNode(link, settings.drive.node_id, dictionary)
     try:

@@ -1,8 +1,8 @@
-"""How well the cycle keeps to the clock on a bus, idle and under load, and what that holds.
+"""Latency of the cycle on a bus, idle and under load, and the shortest cycle that it holds.
 
 The drive is set up as for a run and gets a SYNC and an RPDO in every cycle, but it is never
-enabled: the controlword is 0 and so is the torque, and the wall's law is not asked (its time is
-that of `scripts/bench law_steps`). At the end everything that was changed in it is put back.
+enabled: controlword and torque are 0 and the law is not evaluated (`scripts/bench law_steps`
+measures its time). At the end all changes in the drive are undone.
 """
 
 import gc
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from canwall.bench.budget import USABLE, Budget, BudgetFrame, bus_budget
+from canwall.bench.budget import USABLE, Budget, cycle_budget
 from canwall.config import Settings
 from canwall.cycle import (
     Exchange,
@@ -28,28 +28,32 @@ from canwall.cycle import (
     real_time_machine,
     run_laws,
 )
-from canwall.drive.pdo import tpdos_on_sync
 from canwall.errors import RunFailedError
 from canwall.record import Ring
 from canwall.run import StopRequest, drive_dictionary, make_axis, make_exchange, on_the_bus
 
-#: Cycles before each phase that are not counted: caches, and a load that has yet to begin [s].
+#: Time before each phase that is not measured: caches fill and the load starts [s].
 _SETTLING_S = 0.3
-#: How often a TPDO may be missing, or an RPDO late, where a cycle is held.
-_RARELY = 1e-3
+#: Share of cycles that may miss their TPDO in a cycle that counts as held.
+_MISSED_SHARE = 1e-3
 #: Interfaces whose frames take no time on a wire.
 _WITHOUT_BIT_RATE = ("virtual", "unixcan")
 
-#: A process that computes all the time, until the one that started it has gone.
+#: Program of a busy process, which ends with the process that started it.
 _COMPUTE = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: sum(range(100_000))"
 
 
 @dataclass(frozen=True)
 class Histogram:
-    """How often what took how long.
+    """Histogram of durations.
 
-    ends_us: upper ends of the buckets, inclusive, shape (n,), ascending [us]; counts: shape (n,);
-    p50_us, p99_us, p999_us, max_us [us].
+    Attributes:
+        ends_us: Upper ends of the buckets, inclusive and ascending [µs], shape (n,).
+        counts: Cycles in each bucket, shape (n,).
+        p50_us: Median [µs].
+        p99_us: 99th percentile [µs].
+        p999_us: 99.9th percentile [µs].
+        max_us: Largest duration [µs].
     """
 
     ends_us: NDArray[np.float64]
@@ -61,20 +65,26 @@ class Histogram:
 
     @classmethod
     def of(cls, histogram: NDArray[np.void]) -> "Histogram":
-        """From a HISTOGRAM array of shape (1,)."""
+        """Convert an array of shape (1,) and dtype HISTOGRAM."""
         ends, counts = buckets_ns(histogram)
         p50, p99, p999 = (percentile_ns(histogram, percent) / 1e3 for percent in (50, 99, 99.9))
         return cls(ends / 1e3, counts, p50, p99, p999, float(histogram["largest_ns"][0]) / 1e3)
 
 
 @dataclass(frozen=True)
-class LatencyPart:
-    """One part of the measurement.
+class LatencyPhase:
+    """One phase of the measurement, idle or under load.
 
-    sync_error: |interval of the SYNC − period|. tpdo_to_rpdo: from the TPDO's arrival, by the
-    kernel's time stamp where the bus has one, to the RPDO being handed over. sync_to_rpdo: from the
-    instant at which the SYNC was due to the RPDO being handed over; the margin before the next SYNC
-    is the period less that.
+    Attributes:
+        name: "idle" or "load".
+        cycles: Cycles measured.
+        missed_tpdo: Cycles without a TPDO.
+        late_rpdo: RPDOs sent after the next SYNC was due.
+        sync_error: |interval between two SYNCs − period|.
+        tpdo_to_rpdo: From the arrival of the TPDO, by the kernel's time stamp if the bus has one,
+            until the RPDO is handed over.
+        sync_to_rpdo: From the instant at which the SYNC is due until the RPDO is handed over. The
+            period minus this is the margin before the next SYNC.
     """
 
     name: str
@@ -88,10 +98,13 @@ class LatencyPart:
 
 @dataclass(frozen=True)
 class ShortestCycle:
-    """What the machine, the interface and the bus hold together.
+    """Shortest cycle that machine, interface and bus hold together.
 
-    holds_s: shortest cycle [s], math.inf where none was seen to be held; by_bus_s, by_machine_s:
-    what either would hold alone. text: one line.
+    Attributes:
+        holds_s: Shortest cycle [s], math.inf if not even the measured one is held.
+        by_bus_s: Shortest cycle that the bus would hold alone [s].
+        by_machine_s: Shortest cycle that the machine would hold alone [s].
+        text: One line about it.
     """
 
     holds_s: float
@@ -102,7 +115,7 @@ class ShortestCycle:
 
 @dataclass(frozen=True)
 class Latency:
-    """The measurement: on what, what the machine granted, its phases, and what follows."""
+    """Result of a measurement: its conditions, its phases, and the shortest cycle."""
 
     interface: str
     channel: str
@@ -111,14 +124,14 @@ class Latency:
     exchange: str
     granted: dict[str, Grant]
     load: str
-    phases: tuple[LatencyPart, ...]
+    phases: tuple[LatencyPhase, ...]
     budget: Budget
     shortest_cycle: ShortestCycle
     notes: tuple[str, ...]
 
 
-def measured_settings(settings: Settings) -> Settings:
-    """The settings of a measurement: in real time, and an end that no schedule changes."""
+def measurement_settings(settings: Settings) -> Settings:
+    """Return the settings of a measurement: in real time and without a schedule."""
     bus = settings.bus.model_copy(update={"pace": "real_time"})
     return settings.model_copy(update={"bus": bus, "schedule": ()})
 
@@ -129,37 +142,53 @@ def measure_latency(
     processes: int,
     threads: int,
     stop: StopRequest,
-    report: Callable[[str], None] = lambda what: None,
-    progress: Callable[[str, float, float], None] = lambda what, now_s, end_s: None,
+    report: Callable[[str], None] = lambda step: None,
+    progress: Callable[[str, float, float], None] = lambda phase, now_s, end_s: None,
 ) -> Latency | None:
-    """Run the cycle for `duration_s` idle, and as long under load; None if it was stopped.
+    """Measure the cycle idle and, with a load, as long under load.
 
-    The load: so many processes, and Python threads of this process, that compute all the time.
-    report is told the steps, progress the part of the measurement, its seconds and their end.
-    Raises ConfigError, DictionaryError, DriveError, RunFailedError where no TPDO comes,
-    can.CanError.
+    Args:
+        settings: Configuration of bus and drive.
+        duration_s: Duration of each phase [s].
+        processes: Busy processes of the load.
+        threads: Busy Python threads of this process in the load.
+        stop: Asked whether to stop.
+        report: Called with each step of the preparation.
+        progress: Called with the phase, its seconds done and their total.
+
+    Returns:
+        The result; None if it was stopped.
+
+    Raises:
+        ConfigError: If the bus cannot be opened.
+        DictionaryError: If the object dictionary cannot be used.
+        DriveError: If the drive cannot be set up.
+        RunFailedError: If no TPDO arrives.
+        can.CanError: If the bus fails.
     """
-    settings = measured_settings(settings)
-    parts = [("idle", (0, 0)), ("load", (processes, threads))][: 2 if processes or threads else 1]
+    settings = measurement_settings(settings)
+    loads = {"idle": (0, 0)}
+    if processes or threads:
+        loads["load"] = (processes, threads)
     dictionary, laws = drive_dictionary(settings), run_laws(settings)
     with on_the_bus(settings) as link:
         ring = Ring.create()
-        report("setting up the drive; it is not enabled")
+        report("setting up the drive, without enabling it")
         axis = make_axis(link, settings, dictionary, laws, ring)
         notes: list[str] = []
         try:
-            budget = _budget(axis, settings)
+            budget = cycle_budget(axis.node, axis.setup, settings.bus)
             with closing(make_exchange(link, [axis])) as exchange:
-                cycling = _Cycling(axis, exchange, stop, progress)
+                measurement = _Measurement(axis, exchange, stop, progress)
                 phases = []
-                for name, load in parts:
-                    # The load comes first: it has neither the priority nor the processor.
+                for name, load in loads.items():
+                    # The load starts first, to inherit neither the priority nor the processor.
                     with (
                         _load(*load),
-                        _no_collection(),
+                        _without_garbage_collection(),
                         real_time_machine(settings.bus.processor) as granted,
                     ):
-                        phases.append(cycling.phase(name, duration_s))
+                        phases.append(measurement.phase(name, duration_s))
                     if stop():
                         return None
         finally:
@@ -173,7 +202,7 @@ def measure_latency(
         bus.cycle_s,
         exchange.name,
         granted,
-        _described(processes, threads),
+        _describe_load(processes, threads),
         tuple(phases),
         budget,
         shortest_cycle(phases, budget, settings, granted),
@@ -181,8 +210,8 @@ def measure_latency(
     )
 
 
-class _Cycling:
-    """The cycle of a drive that is not enabled, and the histograms of a part of it."""
+class _Measurement:
+    """Cycle of a drive that is not enabled, with histograms for each phase."""
 
     def __init__(
         self,
@@ -195,10 +224,10 @@ class _Cycling:
         self._stop, self._progress = stop, progress
         self._period_s = axis.settings.bus.cycle_s
 
-    def phase(self, name: str, duration_s: float) -> LatencyPart:
-        """So many seconds of cycles. Raises RunFailedError where no TPDO comes at all."""
+    def phase(self, name: str, duration_s: float) -> LatencyPhase:
+        """Measure for `duration_s` seconds. Raises RunFailedError if no TPDO arrives at all."""
         axis, exchange = self._axis, self._exchange
-        self._run(name, _SETTLING_S, told=False)
+        self._run(name, _SETTLING_S, report=False)
         missed_before = int(axis.cycle["missed_tpdo"][0])
         if missed_before and missed_before == int(axis.cycle["j"][0]):
             raise RunFailedError(
@@ -207,11 +236,11 @@ class _Cycling:
         late_before = axis.late_rpdo
         histograms = (exchange.sync_error, axis.latency, axis.sync_to_rpdo)
         for histogram in histograms:
-            # In place: compiled code knows where they are.
+            # In place: compiled code has their addresses.
             histogram[:] = np.zeros(1, histogram.dtype)
         first = int(axis.cycle["j"][0])
-        self._run(name, duration_s, told=True)
-        return LatencyPart(
+        self._run(name, duration_s, report=True)
+        return LatencyPhase(
             name,
             int(axis.cycle["j"][0]) - first,
             int(axis.cycle["missed_tpdo"][0]) - missed_before,
@@ -219,19 +248,19 @@ class _Cycling:
             *(Histogram.of(histogram) for histogram in histograms),
         )
 
-    def _run(self, name: str, duration_s: float, told: bool) -> None:
+    def _run(self, name: str, duration_s: float, report: bool) -> None:
         cycles = max(1, round(duration_s / self._period_s))
         cycle, first = self._axis.cycle, int(self._axis.cycle["j"][0])
         while (done := int(cycle["j"][0]) - first) < cycles and not self._stop():
-            if told:
+            if report:
                 self._progress(name, done * self._period_s, cycles * self._period_s)
             self._exchange.cycle(min(self._exchange.ahead, cycles - done))
             self._axis.ring.take_rows()
 
 
 @contextmanager
-def _no_collection() -> Iterator[None]:
-    """As in a run: a collection would stop the cycle for milliseconds."""
+def _without_garbage_collection() -> Iterator[None]:
+    """Disable garbage collection, as in a run: it would stop the cycle for milliseconds."""
     gc.collect()
     gc.disable()
     try:
@@ -242,11 +271,11 @@ def _no_collection() -> Iterator[None]:
 
 @contextmanager
 def _load(processes: int, threads: int) -> Iterator[None]:
-    """Processes and threads that compute all the time."""
-    over = threading.Event()
+    """Run busy processes and threads for as long as the context lasts."""
+    ended = threading.Event()
 
     def compute() -> None:
-        while not over.is_set():
+        while not ended.is_set():
             sum(range(100))
 
     workers = [threading.Thread(target=compute, daemon=True) for _ in range(threads)]
@@ -255,67 +284,55 @@ def _load(processes: int, threads: int) -> Iterator[None]:
             busy = subprocess.Popen([sys.executable, "-c", _COMPUTE], start_new_session=True)
             stack.callback(busy.wait)
             stack.callback(busy.kill)
-        stack.callback(over.set)
+        stack.callback(ended.set)
         for worker in workers:
             worker.start()
         yield
 
 
-def _described(processes: int, threads: int) -> str:
+def _describe_load(processes: int, threads: int) -> str:
     parts = []
     if processes:
-        parts.append(
-            f"{processes} process{'es' if processes > 1 else ''} that compute all the time"
-        )
+        parts.append(f"{processes} busy process{'es' if processes > 1 else ''}")
     if threads:
-        parts.append(f"{threads} Python thread{'s' if threads > 1 else ''} of its own process")
+        plural = "s" if threads > 1 else ""
+        parts.append(f"{threads} busy Python thread{plural} in the process of the cycle")
     return " and ".join(parts) or "none"
 
 
-def _budget(axis: WallAxis, settings: Settings) -> Budget:
-    """Of all that the drive sends with a SYNC, and of the cycle's own frames."""
-    setup, bus = axis.setup, settings.bus
-    return bus_budget(
-        BudgetFrame("SYNC", setup.sync_cob_id, 1 if setup.sync_counter_overflow else 0),
-        [BudgetFrame("TPDO", tpdo.cob_id, tpdo.length) for tpdo in tpdos_on_sync(axis.node)],
-        [BudgetFrame("RPDO", setup.rpdo.cob_id, setup.rpdo.length)],
-        bus.bitrate,
-        bus.cycle_s,
-    )
-
-
 def shortest_cycle(
-    phases: Sequence[LatencyPart], budget: Budget, settings: Settings, granted: dict[str, Grant]
+    phases: Sequence[LatencyPhase], budget: Budget, settings: Settings, granted: dict[str, Grant]
 ) -> ShortestCycle:
-    """The shortest cycle that is held: one RPDO of a thousand may come after the next SYNC.
+    """Estimate the shortest cycle that is held, with one RPDO in a thousand after the next SYNC.
 
-    By the machine: the p99.9 of SYNC to RPDO, and the time that frames take on the wire after that;
-    on a bus without a bit rate all of them, as they would at `bus.bitrate`. By the bus: its budget.
+    The bus is bound by its budget. The machine is bound by the p99.9 from SYNC to RPDO plus the
+    time that the RPDO takes on the wire. On a bus without a bit rate this is the time of all
+    frames at `bus.bitrate`.
     """
     bus = settings.bus
     worst = max(phases, key=lambda phase: phase.sync_to_rpdo.p999_us)
     wire = budget.bits if _without_bit_rate(settings) else budget.lines[-1].bits
     by_bus_s = 1.0 / budget.highest_hz
     by_machine_s = worst.sync_to_rpdo.p999_us * 1e-6 + wire / bus.bitrate
-    missing = next((p for p in phases if p.missed_tpdo > _RARELY * p.cycles), None)
+    missing = next((p for p in phases if p.missed_tpdo > _MISSED_SHARE * p.cycles), None)
     if missing is not None:
         share = missing.missed_tpdo / missing.cycles
         text = (
-            f"not even bus.cycle_s = {bus.cycle_s:g} is held: {share:.2%} of the TPDOs do not come "
-            f"within 80 % of the cycle ({_when(missing)})"
+            f"not even bus.cycle_s = {bus.cycle_s:g} is held: {share:.2%} of the TPDOs do not "
+            f"arrive within 80 % of the cycle ({_when(missing)})"
         )
         return ShortestCycle(math.inf, by_bus_s, math.inf, text)
     holds_s = math.ceil(max(by_bus_s, by_machine_s) * 1e5) / 1e5
     if by_bus_s >= by_machine_s:
         why = (
-            f"bound by the bus: a cycle has {budget.bits} bits, and {USABLE:.0%} of "
-            f"{bus.bitrate / 1000:g} kbit/s may be used; the machine alone would hold "
+            f"limited by the bus: a cycle has {budget.bits} bits, and {USABLE:.0%} of "
+            f"{bus.bitrate / 1000:g} kbit/s are usable; the machine alone would hold "
             f"{by_machine_s * 1e6:.0f} µs"
         )
     else:
         why = (
-            f"bound by the machine: {worst.sync_to_rpdo.p999_us:.0f} µs from SYNC to RPDO at p99.9 "
-            f"({_when(worst)}), most of it {_largest_part(worst)}{_priority(granted)}, and "
+            f"limited by the machine: {worst.sync_to_rpdo.p999_us:.0f} µs from SYNC to RPDO at "
+            f"p99.9 ({_when(worst)}), most of it {_largest_part(worst)}{_priority(granted)}, and "
             f"{wire / bus.bitrate * 1e6:.0f} µs on a wire of {bus.bitrate / 1000:g} kbit/s; the "
             f"bus alone would hold {by_bus_s * 1e6:.0f} µs"
         )
@@ -333,17 +350,17 @@ def _without_bit_rate(settings: Settings) -> bool:
     return bus.interface in _WITHOUT_BIT_RATE or bus.channel.startswith("vcan")
 
 
-def _when(phase: LatencyPart) -> str:
+def _when(phase: LatencyPhase) -> str:
     return "under load" if phase.name == "load" else phase.name
 
 
-def _largest_part(phase: LatencyPart) -> str:
-    """Which part of the way from SYNC to RPDO is the longest, by its p99.9."""
+def _largest_part(phase: LatencyPhase) -> str:
+    """Return the part of the way from SYNC to RPDO that is the longest by its p99.9."""
     late, own = phase.sync_error.p999_us, phase.tpdo_to_rpdo.p999_us
     parts = {
-        "the SYNC that is late": late,
+        "the SYNC being late": late,
         "from TPDO to RPDO": own,
-        "until the TPDO comes": phase.sync_to_rpdo.p999_us - late - own,
+        "waiting for the TPDO": phase.sync_to_rpdo.p999_us - late - own,
     }
     return max(parts, key=lambda name: parts[name])
 

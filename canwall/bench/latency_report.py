@@ -1,4 +1,4 @@
-"""A measured latency for people and for programs: histograms as text, picture, numbers."""
+"""Report of a measured latency: text, picture, histograms as CSV, numbers as JSON."""
 
 import csv
 import json
@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import NDArray
 
-from canwall.bench.latency import Histogram, Latency, LatencyPart
+from canwall.bench.latency import Histogram, Latency, LatencyPhase
 from canwall.errors import InputError
 from canwall.figure_style import COLOURS, STYLE
 
@@ -24,14 +24,18 @@ _PERCENTILES = ("p50", "p99", "p999", "max")
 
 
 class Quantity(NamedTuple):
-    """What is measured in each phase.
+    """A quantity of each phase.
 
-    name: in the files. of: its histogram. margin: what is told is the cycle less this.
+    Attributes:
+        name: Name in the files.
+        title: Title in text and picture.
+        of: Returns its histogram.
+        margin: True if the cycle minus the histogram's value is reported.
     """
 
     name: str
     title: str
-    of: Callable[[LatencyPart], Histogram]
+    of: Callable[[LatencyPhase], Histogram]
     margin: bool = False
 
 
@@ -44,8 +48,11 @@ QUANTITIES = (
 )
 
 
-def percentiles_us(latency: Latency, quantity: Quantity, phase: LatencyPart) -> dict[str, float]:
-    """p50, p99, p99.9 and max [us]; a margin: what so many cycles have at least, and the least."""
+def percentiles_us(latency: Latency, quantity: Quantity, phase: LatencyPhase) -> dict[str, float]:
+    """Return p50, p99, p99.9 and max of a quantity [µs].
+
+    For a margin they are what that share of the cycles has at least, and min.
+    """
     histogram = quantity.of(phase)
     values = (getattr(histogram, f"{name}_us") for name in _PERCENTILES)
     if not quantity.margin:
@@ -56,11 +63,11 @@ def percentiles_us(latency: Latency, quantity: Quantity, phase: LatencyPart) -> 
     )
 
 
-def lines(latency: Latency) -> Iterator[str]:
-    """The histograms as text, in bins of 1, 2, 5, 10 … µs, with bars that are logarithmic."""
+def report_lines(latency: Latency) -> Iterator[str]:
+    """Yield the histograms as text, with bins of 1, 2, 5, 10 … µs and logarithmic bars."""
     yield (
         f"{latency.interface} {latency.channel}, cycle {latency.cycle_s * 1e3:g} ms, exchange "
-        f"{latency.exchange}; the drive is set up, not enabled, and gets zero torque"
+        f"{latency.exchange}; the drive is set up but not enabled, with zero torque"
     )
     yield f"load: {latency.load}"
     for what, grant in latency.granted.items():
@@ -69,7 +76,7 @@ def lines(latency: Latency) -> Iterator[str]:
     for quantity in QUANTITIES:
         yield ""
         yield f"{quantity.title} [µs]"
-        yield from _bars(latency, quantity)
+        yield from _bar_lines(latency, quantity)
         for phase in latency.phases:
             numbers = percentiles_us(latency, quantity, phase)
             yield f"  {phase.name:>5}: " + ", ".join(f"{k} {v:.1f}" for k, v in numbers.items())
@@ -81,10 +88,10 @@ def lines(latency: Latency) -> Iterator[str]:
         )
 
 
-def _bars(latency: Latency, quantity: Quantity) -> Iterator[str]:
+def _bar_lines(latency: Latency, quantity: Quantity) -> Iterator[str]:
     histograms = [quantity.of(phase) for phase in latency.phases]
-    edges = _edges(max(histogram.max_us for histogram in histograms))
-    binned = [_binned(histogram, edges) for histogram in histograms]
+    edges = _bin_edges(max(histogram.max_us for histogram in histograms))
+    binned = [_bin_counts(histogram, edges) for histogram in histograms]
     total = max(int(counts.sum()) for counts in binned)
     used = np.flatnonzero(np.sum(binned, axis=0))
     if not len(used):
@@ -96,17 +103,17 @@ def _bars(latency: Latency, quantity: Quantity) -> Iterator[str]:
         if quantity.margin:
             period = latency.cycle_s * 1e6
             low, high = period - high, period - low
-        cells = "".join(_cell(int(counts[k]), total) for counts in binned)
-        yield f"  {low:>6g} – {high:<6g}  {cells.rstrip()}"
+        bars = "".join(_bar(int(counts[k]), total) for counts in binned)
+        yield f"  {low:>6g} – {high:<6g}  {bars.rstrip()}"
 
 
-def _cell(count: int, total: int) -> str:
+def _bar(count: int, total: int) -> str:
     length = math.ceil(_BAR * math.log1p(count) / math.log1p(total)) if count else 0
     return f"{count:>8} {'█' * length:<{_BAR}} "
 
 
-def _edges(largest_us: float) -> NDArray[np.float64]:
-    """0, 1, 2, 5, 10 … up to what has the largest value in its last bin [us]."""
+def _bin_edges(largest_us: float) -> NDArray[np.float64]:
+    """Return edges 0, 1, 2, 5, 10 … with the largest value in the last bin [µs]."""
     edges = [0.0]
     decade = 1.0
     while True:
@@ -117,36 +124,36 @@ def _edges(largest_us: float) -> NDArray[np.float64]:
         decade *= 10.0
 
 
-def _binned(histogram: Histogram, edges: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Counts between the edges, upper ones inclusive; shape (n − 1,)."""
-    places = np.searchsorted(edges[1:], np.minimum(histogram.ends_us, histogram.max_us))
+def _bin_counts(histogram: Histogram, edges: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Count cycles between the edges, upper ones inclusive; shape (n − 1,)."""
+    bins = np.searchsorted(edges[1:], np.minimum(histogram.ends_us, histogram.max_us))
     counts = np.zeros(len(edges) - 1, np.int64)
-    np.add.at(counts, places, histogram.counts)
+    np.add.at(counts, bins, histogram.counts)
     return counts
 
 
 def write_latency(latency: Latency, folder: Path) -> list[Path]:
-    """latency.json, latency.csv and latency.png into a folder; their paths.
+    """Write latency.json, latency.csv and latency.png into a folder and return their paths.
 
-    latency.csv has every bucket: quantity, phase, up to how many µs, and how many cycles; its
-    margin is given as the time from SYNC to RPDO. Raises InputError where it cannot be written.
+    latency.csv has every bucket: quantity, phase, upper end [µs], cycles. It has the time from
+    SYNC to RPDO instead of the margin. Raises InputError if the folder cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         paths = [folder / f"latency.{ending}" for ending in ("json", "csv", "png")]
-        text = json.dumps(_numbers(latency), indent=2, ensure_ascii=False)
+        text = json.dumps(_json_content(latency), indent=2, ensure_ascii=False)
         paths[0].write_text(text + "\n", encoding="utf-8")
         with paths[1].open("w", newline="", encoding="utf-8") as file:
             table = csv.writer(file)
             table.writerow(("quantity", "phase", "up_to_us", "cycles"))
-            table.writerows(_buckets(latency))
-        _draw(latency, paths[2])
+            table.writerows(_csv_rows(latency))
+        _draw_figure(latency, paths[2])
     except OSError as error:
         raise InputError(f"--output {folder}: {error.strerror}") from None
     return paths
 
 
-def _numbers(latency: Latency) -> dict[str, Any]:
+def _json_content(latency: Latency) -> dict[str, Any]:
     budget, shortest_cycle = latency.budget, latency.shortest_cycle
     return {
         "interface": latency.interface,
@@ -174,7 +181,7 @@ def _numbers(latency: Latency) -> dict[str, Any]:
     }
 
 
-def _buckets(latency: Latency) -> Iterator[tuple[str, str, float, int]]:
+def _csv_rows(latency: Latency) -> Iterator[tuple[str, str, float, int]]:
     for quantity in QUANTITIES:
         name = "sync_to_rpdo" if quantity.margin else quantity.name
         for phase in latency.phases:
@@ -183,11 +190,11 @@ def _buckets(latency: Latency) -> Iterator[tuple[str, str, float, int]]:
                 yield name, phase.name, float(end), int(count)
 
 
-def _draw(latency: Latency, path: Path) -> None:
+def _draw_figure(latency: Latency, path: Path) -> None:
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(12, 4.2), layout="constrained", dpi=120)
         for axes, quantity in zip(figure.subplots(1, len(QUANTITIES)), QUANTITIES, strict=True):
-            _panel(axes, latency, quantity)
+            _draw_panel(axes, latency, quantity)
         rate = f"{latency.cycle_s * 1e3:g} ms"
         figure.suptitle(
             f"{latency.interface} {latency.channel}, {latency.exchange}, cycle {rate}; "
@@ -199,13 +206,13 @@ def _draw(latency: Latency, path: Path) -> None:
         figure.savefig(path)
 
 
-def _panel(axes: Axes, latency: Latency, quantity: Quantity) -> None:
-    """Cycles per tenth of an octave, idle and under load, with their p99.9."""
+def _draw_panel(axes: Axes, latency: Latency, quantity: Quantity) -> None:
+    """Draw the cycles per tenth of an octave, idle and under load, with their p99.9."""
     histograms = [quantity.of(phase) for phase in latency.phases]
-    known = [histogram for histogram in histograms if len(histogram.ends_us)]
-    low = max(0.1, min((histogram.ends_us[0] for histogram in known), default=0.1))
-    high = max(low, max((histogram.max_us for histogram in known), default=low))
-    # Buckets are 1/32 to 1/64 of an octave apart: a tenth of one never falls between two.
+    filled = [histogram for histogram in histograms if len(histogram.ends_us)]
+    low = max(0.1, min((histogram.ends_us[0] for histogram in filled), default=0.1))
+    high = max(low, max((histogram.max_us for histogram in filled), default=low))
+    # Buckets are 1/32 to 1/64 of an octave apart, so every bin of a tenth has at least three.
     edges = low * 2.0 ** (np.arange(-1, math.ceil(10 * math.log2(high / low)) + 2) / 10)
     for phase, histogram, colour in zip(
         latency.phases, histograms, (COLOURS[1], COLOURS[0]), strict=False
@@ -213,15 +220,15 @@ def _panel(axes: Axes, latency: Latency, quantity: Quantity) -> None:
         ends = np.clip(histogram.ends_us, edges[0], edges[-1])
         counts, _ = np.histogram(ends, edges, weights=histogram.counts)
         numbers = percentiles_us(latency, quantity, phase)
-        what = f"{phase.name}, margin" if quantity.margin else phase.name
-        label = f"{what}: p50 {numbers['p50']:.0f}, p99.9 {numbers['p99.9']:.0f} µs"
+        name = f"{phase.name}, margin" if quantity.margin else phase.name
+        label = f"{name}: p50 {numbers['p50']:.0f}, p99.9 {numbers['p99.9']:.0f} µs"
         axes.stairs(counts, edges, color=colour, label=label, fill=True, alpha=0.35)
         axes.stairs(counts, edges, color=colour)
         axes.axvline(histogram.p999_us, color=colour, linestyle="--", linewidth=1)
     if quantity.margin:
         period_us = latency.cycle_s * 1e6
         axes.axvline(period_us, color="black", linewidth=1.5, label="the next SYNC")
-        axes.set_title("SYNC due → RPDO; what is left is the margin")
+        axes.set_title("SYNC due → RPDO; the rest of the cycle is the margin")
     else:
         axes.set_title(quantity.title)
     axes.set_xscale("log")

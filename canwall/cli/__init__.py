@@ -1,11 +1,12 @@
-"""The commands, thin: options in, one call, tables and error lines out.
+"""Command line: parses options, makes one call, prints tables and error lines.
 
-A module for each group of commands; what they share is in `options`, `output`, `ending`, `program`.
+There is a module for each group of commands; `options`, `output`, `ending` and `program` have what
+they share.
 """
 
 from typing import NoReturn
 
-from canwall.cli import bench, run, sweep, workbench
+from canwall.cli import bench, run, study, sweep, workbench
 from canwall.cli.ending import INTERRUPTED, guarded
 from canwall.cli.program import make_program, run_program
 
@@ -26,8 +27,9 @@ for command in (
     workbench.figures,
 ):
     app.command()(command)
+app.add_typer(study.study, name="study")
 
 
 def main() -> NoReturn:
-    """Entry point of the command `canwall`; ends the process with the exit code."""
+    """Run the command `canwall` and exit with its exit code."""
     run_program(app)

@@ -1,4 +1,4 @@
-"""Commands that examine a bench before anybody presses on a wall: `doctor`, `latency`."""
+"""Commands that examine a bench before a wall is rendered on it: `doctor`, `latency`."""
 
 import os
 from pathlib import Path
@@ -10,7 +10,7 @@ from rich.table import Table
 
 from canwall.cli.ending import FAILED, StoppedError
 from canwall.cli.options import ConfigArgument, EdsOption, NoWatchdogOption, absolute, settings_from
-from canwall.cli.output import ShownProgress, console, errors, say
+from canwall.cli.output import ProgressDisplay, console, errors, say
 
 if TYPE_CHECKING:
     from canwall.bench import Findings
@@ -23,7 +23,7 @@ def doctor(
 ) -> int:
     """Find the drive, show how it would be set up and why, and test its watchdog.
 
-    The drive is enabled with zero torque for the test. What was changed is put back.
+    The drive is enabled with zero torque for the test. All changes are undone.
     """
     settings = settings_from(
         config_file,
@@ -34,29 +34,29 @@ def doctor(
     from canwall.drive import REQUIRED_OBJECTS
     from canwall.run import on_the_bus
 
-    def announce(what: str) -> None:
-        errors.print(f"doctor: {what}", markup=False)
+    def announce(step: str) -> None:
+        errors.print(f"doctor: {step}", markup=False)
 
     findings = Findings()
     try:
         with on_the_bus(settings) as link:
             examine(link, settings, REQUIRED_OBJECTS, announce, findings)
     finally:
-        _show_findings(findings)
+        _print_findings(findings)
     return 0 if findings.well else FAILED
 
 
 def latency(
     config_file: ConfigArgument = None,
     duration: Annotated[
-        float, typer.Option(min=0.1, help="Seconds of each part: idle, and under load.")
+        float, typer.Option(min=0.1, help="Seconds of each phase: idle, and under load.")
     ] = 10.0,
     load: Annotated[
         int | None,
-        typer.Option(min=0, help="Processes that compute meanwhile; without: one per core."),
+        typer.Option(min=0, help="Busy processes of the load; without: one per core."),
     ] = None,
     threads: Annotated[
-        int, typer.Option(min=0, help="Python threads of the same process that compute as well.")
+        int, typer.Option(min=0, help="Busy Python threads in the process of the cycle.")
     ] = 0,
     exchange: Annotated[
         str | None, typer.Option(help="native, python-can or auto, instead of bus.exchange.")
@@ -67,10 +67,10 @@ def latency(
     eds: EdsOption = None,
     accept_no_watchdog: NoWatchdogOption = False,
 ) -> int:
-    """How well the cycle keeps to the clock on the bus of CONFIG, and what cycle is held.
+    """Measure the timing of the cycle on the bus of CONFIG, and the shortest cycle it can hold.
 
-    SYNC, TPDO and RPDO go as in a run, idle and then under load, but the drive is not enabled and
-    gets zero torque. What was changed is put back.
+    SYNC, TPDO and RPDO are exchanged as in a run, idle and then under load, but the drive is not
+    enabled and gets zero torque. All changes are undone.
     """
     settings = settings_from(
         config_file,
@@ -79,29 +79,29 @@ def latency(
         drive__accept_no_watchdog=accept_no_watchdog or None,
     )
     from canwall.bench import measure_latency
-    from canwall.bench.latency_report import lines, write_latency
+    from canwall.bench.latency_report import report_lines, write_latency
     from canwall.run import stop_on_signals
 
     processes = os.cpu_count() or 1 if load is None else load
-    with ShownProgress() as shown, stop_on_signals() as stop:
-        found = measure_latency(
-            settings, duration, processes, threads, stop, shown.report, shown.part
+    with ProgressDisplay() as display, stop_on_signals() as stop:
+        measured = measure_latency(
+            settings, duration, processes, threads, stop, display.report, display.phase
         )
-    if found is None:
-        raise StoppedError("interrupted; the drive is as it was")
-    for line in lines(found):
+    if measured is None:
+        raise StoppedError("interrupted; the drive is as it was before")
+    for line in report_lines(measured):
         console.print(line, soft_wrap=True, highlight=False, markup=False)
     if output is not None:
-        for path in write_latency(found, output):
+        for path in write_latency(measured, output):
             console.print(str(path), soft_wrap=True, highlight=False)
-    for note in found.notes:
+    for note in measured.notes:
         say(note)
-    console.print(found.shortest_cycle.text, soft_wrap=True, highlight=False, markup=False)
+    console.print(measured.shortest_cycle.text, soft_wrap=True, highlight=False, markup=False)
     return 0
 
 
-def _show_findings(findings: "Findings") -> None:
-    """A table for people at a terminal, a line each for everybody else."""
+def _print_findings(findings: "Findings") -> None:
+    """Print a table on a terminal, otherwise a line for each finding."""
     if not console.is_terminal:
         for line in findings.lines:
             trouble = "" if line.well else "TROUBLE: "
@@ -118,8 +118,8 @@ def _show_findings(findings: "Findings") -> None:
     section = ""
     for line in findings.lines:
         style = "" if line.well else "bold red"
-        shown = "" if line.section == section else line.section
-        table.add_row(*(escape(text) for text in (shown, line.what, line.found)), style=style)
+        heading = "" if line.section == section else line.section
+        table.add_row(*(escape(text) for text in (heading, line.what, line.found)), style=style)
         section = line.section
     if findings.lines:
         console.print(table)

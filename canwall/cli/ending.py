@@ -1,4 +1,4 @@
-"""How every command ends: exit codes, and errors as one line."""
+"""End of every command: exit codes, and errors as one line."""
 
 from collections.abc import Callable
 
@@ -8,16 +8,16 @@ from can import CanError
 from canwall.cli.output import say
 from canwall.errors import InputError, RunFailedError
 
-#: Exit codes: a run that failed or tripped, bad input, and Ctrl-C with the drive disabled.
+#: Exit codes: a run that failed or tripped, bad input, Ctrl-C with the drive disabled.
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
 
 class StoppedError(Exception):
-    """Ctrl-C, and what to say of it."""
+    """Ctrl-C in a command that has a message about it."""
 
 
 def guarded(command: Callable[[], object]) -> int:
-    """Every error as one line; a traceback is a bug."""
+    """Run a command and return its exit code; an error becomes one line, anything else is a bug."""
     try:
         result = command()
     except StoppedError as interrupted:
@@ -26,7 +26,7 @@ def guarded(command: Callable[[], object]) -> int:
     except (KeyboardInterrupt, typer.Abort):
         return INTERRUPTED
     except typer.TyperException as error:
-        if text := error.format_message():  # none where the help was shown instead
+        if text := error.format_message():  # empty if the help was shown instead
             say(text)
         return BAD_INPUT
     except InputError as error:

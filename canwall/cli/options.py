@@ -1,4 +1,4 @@
-"""Arguments and options that several commands have, and the settings that they lead to."""
+"""Arguments and options shared by several commands, and the settings made from them."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,12 +16,15 @@ EdsOption = Annotated[
 ]
 NoWatchdogOption = Annotated[
     bool,
-    typer.Option("--accept-no-watchdog", help="Go on with a drive that has no watchdog."),
+    typer.Option("--accept-no-watchdog", help="Accept a drive that has no watchdog."),
 ]
 
 
 def settings_from(path: Path | None, **overrides: Any) -> Settings:
-    """The settings of a file, with what was given on the command line instead."""
+    """Load a configuration, by default config/sim.toml, with keys given on the command line.
+
+    Overrides have "__" for the dot of a key; None stands for an option that was not given.
+    """
     dotted = {
         key.replace("__", "."): value for key, value in overrides.items() if value is not None
     }
@@ -29,5 +32,5 @@ def settings_from(path: Path | None, **overrides: Any) -> Settings:
 
 
 def absolute(path: Path | None) -> Path | None:
-    """What is given on the command line is relative to where one is, not to the configuration."""
+    """Resolve a path of the command line, relative to the working directory."""
     return path and path.resolve()

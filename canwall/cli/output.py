@@ -1,4 +1,4 @@
-"""What a terminal shows of every command: the two consoles, error lines, progress."""
+"""Output of the commands: the two consoles, error lines, progress."""
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -8,12 +8,12 @@ errors = Console(stderr=True, soft_wrap=True, highlight=False)
 
 
 def say(text: str) -> None:
-    """Error, warning or note: a line on standard error."""
+    """Print an error, a warning or a note as a line on standard error."""
     errors.print(f"canwall: {text}", markup=False)
 
 
-class ShownProgress:
-    """Progress: what is being done, then seconds of bus time, or steps."""
+class ProgressDisplay:
+    """Progress on standard error: the current step, with seconds of bus time or a count."""
 
     def __init__(self) -> None:
         self._progress = Progress(
@@ -26,31 +26,31 @@ class ShownProgress:
         )
         self._task = self._progress.add_task("preparing", total=None, clock="")
 
-    def __enter__(self) -> "ShownProgress":
+    def __enter__(self) -> "ProgressDisplay":
         self._progress.start()
         return self
 
     def __exit__(self, error: type[BaseException] | None, *exc_info: object) -> None:
-        # The line that an error becomes stands alone.
+        # Erase the display if an error line follows.
         self._progress.live.transient = error is not None
         self._progress.stop()
 
     def report(self, what: str) -> None:
-        """What is being done now."""
+        """Show the step that begins now."""
         self._progress.update(self._task, description=what)
 
     def advance(self, now_s: float, end_s: float | None) -> None:
-        """So many seconds of so many, or until it is stopped."""
+        """Show the seconds done, of a total or until stopped."""
         clock = f"{now_s:.1f} s" if end_s is None else f"{now_s:.1f} of {end_s:g} s"
         self._progress.update(self._task, completed=now_s, total=end_s, clock=clock)
 
-    def part(self, what: str, now_s: float, end_s: float) -> None:
-        """So many seconds of so many, of a part that has a name."""
+    def phase(self, what: str, now_s: float, end_s: float) -> None:
+        """Show the seconds done of a named phase."""
         self.report(what)
         self.advance(now_s, end_s)
 
     def count(self, what: str, done: int, total: int) -> None:
-        """So many steps of so many."""
+        """Show the steps done of a total."""
         clock = f"{done} of {total}"
         self._progress.update(
             self._task, description=what, completed=done, total=total, clock=clock

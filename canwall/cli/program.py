@@ -1,4 +1,4 @@
-"""A program of commands, `canwall` or a script's: how it shows its help, and how it is run."""
+"""Construction and execution of a program of commands: `canwall`, or one of its groups."""
 
 import sys
 from typing import Any, NoReturn
@@ -9,7 +9,7 @@ from canwall.cli.ending import guarded
 
 
 def make_program(**settings: Any) -> typer.Typer:
-    """A program without commands yet; settings are `typer.Typer`'s."""
+    """Make a program without commands; settings are those of `typer.Typer`."""
     return typer.Typer(
         add_completion=False,
         pretty_exceptions_enable=False,
@@ -19,5 +19,5 @@ def make_program(**settings: Any) -> typer.Typer:
 
 
 def run_program(program: typer.Typer) -> NoReturn:
-    """By the command line; ends the process with the exit code."""
+    """Run the program with the arguments of the process and exit with its exit code."""
     sys.exit(guarded(lambda: program(standalone_mode=False)))

@@ -1,4 +1,4 @@
-"""Commands that render walls: `run`, `change` meanwhile, and `drive`, the other end of the bus."""
+"""Commands that render walls: `run`, `change` during a run, and the simulated `drive`."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,7 +9,7 @@ from rich.table import Table
 from canwall import config
 from canwall.cli.ending import FAILED, INTERRUPTED
 from canwall.cli.options import ConfigArgument, EdsOption, NoWatchdogOption, absolute, settings_from
-from canwall.cli.output import ShownProgress, console, say
+from canwall.cli.output import ProgressDisplay, console, say
 from canwall.config import ConfigError, Settings, absolute_law
 
 
@@ -34,8 +34,8 @@ def run(
 ) -> int:
     """Render the wall: enable the drive, run, record, disable it again.
 
-    Several files: as many drives on one bus, each with its wall, on one SYNC. --law also ends the
-    changes of law that the file schedules.
+    Several files: as many drives on one bus, each with its wall, on one SYNC. With --law, changes
+    of law in [[schedule]] are skipped.
     """
     files = config_files or [config.shipped("config/sim.toml")]
     overrides = {
@@ -50,8 +50,8 @@ def run(
     many = [_run_settings(path, overrides) for path in files]
     from canwall.run import run_together  # numba takes a second to load: not for --help
 
-    with ShownProgress() as shown:
-        results = run_together(many, output, shown.report, shown.advance)
+    with ProgressDisplay() as display:
+        results = run_together(many, output, display.report, display.advance)
     for result in results:
         console.print(_strike_table(result.summary["strikes"]))
         console.print(f"record: {result.folder.path}", soft_wrap=True, highlight=False)
@@ -78,17 +78,17 @@ def _run_settings(path: Path, overrides: dict[str, Any]) -> Settings:
 
 
 def change(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run that goes on.")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run in progress.")],
     assignments: Annotated[
         list[str],
         typer.Argument(metavar="KEY=VALUE", help="stiffness_nm_per_rad=80, limits.torque_nm=1"),
     ],
 ) -> int:
-    """Change the wall of a run while it is rendered; the keys are those of [[schedule]]."""
+    """Change the wall of a run in progress; the keys are those of [[schedule]]."""
     from canwall.record import RunFolder
-    from canwall.run.changes import change as post
+    from canwall.run.changes import post_change
 
-    cycle = post(RunFolder(folder), assignments)
+    cycle = post_change(RunFolder(folder), assignments)
     console.print(f"in force from cycle {cycle} on", highlight=False)
     return 0
 
@@ -96,23 +96,23 @@ def change(
 def drive(
     config_file: ConfigArgument = None,
     real_time: Annotated[
-        bool, typer.Option("--real-time", help="Time as measured, not a period per SYNC.")
+        bool, typer.Option("--real-time", help="Measured time instead of a period per SYNC.")
     ] = False,
     eds: EdsOption = None,
 ) -> int:
-    """A simulated drive, alone on the bus of CONFIG, until stopped."""
+    """Simulate a drive, alone on the bus of CONFIG, until stopped."""
     settings = settings_from(config_file, drive__eds=absolute(eds))
     if real_time and settings.simulation is not None:
         simulation = settings.simulation.model_copy(update={"real_time": True})
         settings = settings.model_copy(update={"simulation": simulation})
     if settings.bus.interface == "virtual":
         raise ConfigError(
-            "bus.interface = 'virtual' ends at this process, so nobody could reach the drive; "
+            "bus.interface = 'virtual' ends at this process, so no master could reach the drive; "
             "use 'unixcan' or 'socketcan' (see config/unixcan.toml)"
         )
     from canwall.run import serve_drive, stop_on_signals
 
-    def joined() -> None:
+    def announce() -> None:
         console.print(
             f"simulated drive, node {settings.drive.node_id}, "
             f"on {settings.bus.interface} {settings.bus.channel}; Ctrl-C ends it",
@@ -120,11 +120,11 @@ def drive(
             highlight=False,
         )
 
-    def reported(fault: str) -> None:
-        console.print(fault, soft_wrap=True, highlight=False, markup=False)
+    def report(event: str) -> None:
+        console.print(event, soft_wrap=True, highlight=False, markup=False)
 
     with stop_on_signals() as stop:
-        serve_drive(settings, stop, joined, reported)
+        serve_drive(settings, stop, announce, report)
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Commands for sweeps: `sweep`, and `plot`, which draws what sweeps and runs have left."""
+"""Commands for sweeps: `sweep`, and `plot`, which draws recorded runs and sweeps."""
 
 from functools import partial
 from pathlib import Path
@@ -7,15 +7,17 @@ from typing import Annotated
 import typer
 
 from canwall.cli.ending import StoppedError
-from canwall.cli.options import settings_from
-from canwall.cli.output import ShownProgress, console
+from canwall.cli.options import ConfigArgument, settings_from
+from canwall.cli.output import ProgressDisplay, console
 from canwall.config import absolute_law
 from canwall.errors import InputError, RunFailedError
 
 
 def sweep(
-    config_file: Annotated[Path, typer.Argument(metavar="CONFIG", help="A TOML file.")],
-    output: Annotated[Path, typer.Option(metavar="FILE.nc", help="NetCDF file of the result.")],
+    config_file: ConfigArgument = None,
+    output: Annotated[
+        Path | None, typer.Option(metavar="FILE.nc", help="NetCDF file of the result.")
+    ] = None,
     law: Annotated[list[str] | None, typer.Option(help="A law; may be repeated.")] = None,
     stiffness: Annotated[
         str | None,
@@ -41,45 +43,97 @@ def sweep(
     workers: Annotated[int | None, typer.Option(min=1, help="Cores; without: all.")] = None,
     dask: Annotated[str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler.")] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with a sweep that was interrupted.")
+        bool, typer.Option("--resume", help="Continue a sweep that was interrupted.")
+    ] = False,
+    table: Annotated[
+        bool,
+        typer.Option(
+            "--table",
+            help="Print the K-limits of laws (--law; without: all) with operators (--operator; "
+            "without: all) as a Markdown table, instead of writing a file. Its other axes are "
+            "fixed; [sweep] of CONFIG is ignored.",
+        ),
     ] = False,
 ) -> int:
-    """How stiff the wall can be: strikes over any axes, or the K-limit at each of their points."""
+    """Sweep strikes over any axes and judge each wall, or search the K-limit at each point."""
     if workers is not None and dask is not None:
         raise InputError("--workers and --dask: keep one; a cluster has workers of its own")
-    given: dict[str, object] = {}
-    for name, equals, values in (text.partition("=") for text in axis or []):
-        if not equals or name in given:
-            raise InputError(f"--axis {name}: has to be NAME=VALUES, each name once")
-        given[name] = values
-    named = {
-        "law": law and [absolute_law(name, Path()) for name in law],
+    laws = [absolute_law(name, Path()) for name in law or []]
+    if table:
+        unused = {
+            "--output": output,
+            "--stiffness": stiffness,
+            "--damping": damping,
+            "--rate": rate,
+            "--axis": axis,
+            "--resume": resume,
+        }
+        if given := ", ".join(option for option, value in unused.items() if value):
+            raise InputError(f"--table has fixed axes and writes no file: leave out {given}")
+        return _print_k_limit_table(config_file, laws, operator, through, workers, dask)
+    if output is None:
+        raise InputError("--output is missing: give the FILE.nc of the result")
+    axes = _parse_axes(axis or [])
+    options = {
+        "law": laws,
         "stiffness": stiffness,
         "damping": damping,
         "rate": rate,
         "operator": operator,
     }
-    given |= {name: values for name, values in named.items() if values}
+    axes |= {name: values for name, values in options.items() if values}
     settings = settings_from(config_file)
-    from canwall.sweep import make_plan, sweep_table, without_effect
-    from canwall.sweep import sweep as swept
+    from canwall.sweep import ineffective_axis_notes, make_plan, sweep_table
+    from canwall.sweep import sweep as run_sweep
 
-    with ShownProgress() as shown:
-        plan = make_plan(settings, given, through)
+    with ProgressDisplay() as display:
+        plan = make_plan(settings, axes, through)
+        progress = partial(display.count, "sweeping")
         try:
-            dataset = swept(plan, output, resume, workers, dask, partial(shown.count, "sweeping"))
+            dataset = run_sweep(plan, output, resume, workers, dask, progress)
         except KeyboardInterrupt:
-            raise StoppedError(f"interrupted; --resume goes on with {output}") from None
+            raise StoppedError(f"interrupted; --resume continues {output}") from None
         except RunFailedError as error:
-            raise RunFailedError(f"{error}; --resume goes on with {output}") from None
+            raise RunFailedError(f"{error}; --resume continues {output}") from None
     console.print(sweep_table(dataset))
-    for line in without_effect(dataset):
-        console.print(line, soft_wrap=True, highlight=False)
+    for note in ineffective_axis_notes(dataset):
+        console.print(note, soft_wrap=True, highlight=False)
     console.print(
-        f"{plan.points_in_all} points: {output}; canwall plot {output} draws them",
+        f"{plan.point_count} points: {output}; canwall plot {output} draws them",
         soft_wrap=True,
         highlight=False,
     )
+    return 0
+
+
+def _parse_axes(assignments: list[str]) -> dict[str, object]:
+    """Split NAME=VALUES of --axis."""
+    axes: dict[str, object] = {}
+    for name, equals, values in (text.partition("=") for text in assignments):
+        if not equals or name in axes:
+            raise InputError(f"--axis {name}: has to be NAME=VALUES, each name once")
+        axes[name] = values
+    return axes
+
+
+def _print_k_limit_table(
+    config_file: Path | None,
+    laws: list[str],
+    operators: list[str] | None,
+    through: str,
+    workers: int | None,
+    dask: str | None,
+) -> int:
+    settings = settings_from(config_file)
+    from canwall.sweep import OPERATORS, TABLE_LAWS, compute_k_limit_table, format_k_limit_table
+
+    laws = laws or list(TABLE_LAWS)
+    with ProgressDisplay() as display:
+        progress = partial(display.count, "searching K-limits")
+        limits = compute_k_limit_table(
+            settings, laws, operators or list(OPERATORS), through, workers, dask, progress
+        )
+    print(format_k_limit_table(limits, laws))
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Commands without a drive: `ball`, and `figures`, the chapter's, drawn anew."""
+"""Commands of the workbench: `ball`, and `figures`, those of the chapter."""
 
 import math
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from canwall.cli.output import ShownProgress, console
+from canwall.cli.output import ProgressDisplay, console
 from canwall.config import absolute_law
 from canwall.errors import InputError
 
@@ -23,14 +23,14 @@ def ball(
     height: Annotated[float, typer.Option(help="Height at the start [m].")] = 1.0,
     speed: Annotated[float, typer.Option(help="Velocity at the start [m/s].")] = 0.0,
     period: Annotated[float, typer.Option(help="Sampling period T [s].")] = 0.1,
-    periods: Annotated[int, typer.Option(help="How many periods.")] = 3000,
+    periods: Annotated[int, typer.Option(help="Number of periods.")] = 3000,
     deadbeat: Annotated[bool, typer.Option("--deadbeat", help="Add the compensation.")] = False,
     tension: Annotated[str, typer.Option(help="allow, clamp or budget.")] = "allow",
     passivity: Annotated[float, typer.Option(help="Passivity controller's damping.")] = 0.0,
     option: Annotated[list[str] | None, typer.Option(help="Law's option, NAME=VALUE.")] = None,
 ) -> int:
-    """A ball bouncing on a floor that is the wall: exact state, no delay, held force."""
-    from canwall.workbench import CONTINUOUS, Ball, bounced, write_ball
+    """Simulate a ball that bounces on the wall as its floor: exact state, no delay, held force."""
+    from canwall.workbench import CONTINUOUS, Ball, simulate_ball, write_ball
 
     ball = Ball(
         stiffness=stiffness,
@@ -48,10 +48,11 @@ def ball(
     )
     if law == CONTINUOUS and (deadbeat or option or tension != "allow" or passivity):
         raise InputError(
-            "--law continuous is no law: it has no --deadbeat, --tension, --passivity, --option"
+            "--law continuous is the referent: leave out --deadbeat, --tension, --passivity, "
+            "--option"
         )
     name = law if law == CONTINUOUS else absolute_law(law, Path())
-    y, v, force = bounced(ball, name, deadbeat, _named_numbers(option or []))
+    y, v, force = simulate_ball(ball, name, deadbeat, _parse_options(option or []))
     write_ball(output, ball, y, v, force)
     energy = ball.energy(y, v)
     outside = (y >= 0.0).nonzero()[0]
@@ -67,26 +68,27 @@ def ball(
     return 0
 
 
-def _named_numbers(given: list[str]) -> dict[str, float]:
-    numbers = {}
-    for text in given:
+def _parse_options(assignments: list[str]) -> dict[str, float]:
+    """Split NAME=NUMBER of --option."""
+    options = {}
+    for text in assignments:
         name, equals, value = text.partition("=")
         try:
-            numbers[name] = float(value)
+            options[name] = float(value)
         except ValueError:
             equals = ""
-        if not equals or not math.isfinite(numbers[name]):
+        if not equals or not math.isfinite(options[name]):
             raise InputError(f"--option {text}: has to be NAME=NUMBER")
-    return numbers
+    return options
 
 
 def figures(
     output: Annotated[Path, typer.Option(help="Folder for pictures, data and index.md.")],
 ) -> int:
-    """The chapter's figures, drawn anew, each beside its data; and all laws compared."""
+    """Draw the figures of the chapter, each with its data, and a comparison of all laws."""
     from canwall.workbench.figures import write_figures
 
-    with ShownProgress() as shown:
-        index = write_figures(output, progress=shown.count)
+    with ProgressDisplay() as display:
+        index = write_figures(output, progress=display.count)
     console.print(str(index), soft_wrap=True, highlight=False)
     return 0

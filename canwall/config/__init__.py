@@ -1,7 +1,7 @@
 """Settings of a run: one TOML file, validated, immutable, in SI units.
 
-Every key carries its unit in its name. What is unknown, misspelt, of the wrong type or impossible
-is a `ConfigError` of one line: file, key, what is wrong, what to do.
+Every key has its unit in its name. An unknown key, a wrong type or an impossible value is a
+`ConfigError` of one line: file, key, what is wrong, what to do.
 """
 
 from canwall.config.drive import Drive

@@ -1,42 +1,48 @@
-"""`[drive]`: which node, described by which EDS or DCF, and how it is to be set up."""
+"""`[drive]`: the node, its object dictionary, and its set-up."""
 
 import re
-from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, field_validator
+from pydantic import AfterValidator, Field
 
-from canwall.config.section import NonNegative, Positive, Section
+from canwall.config.section import FilePath, NonNegative, Positive, Section
 
 _OBJECT = re.compile(r"0x([0-9A-Fa-f]{4})(?::([0-9A-Fa-f]{1,2}))?")
 
 
-def _named_objects(value: dict[str, int]) -> dict[str, int]:
+def _check_object_names(value: dict[str, int]) -> dict[str, int]:
     for name in value:
         if _OBJECT.fullmatch(name) is None:
-            raise ValueError(f"{name!r} names no object; write e.g. '0x6072' or '0x608F:01'")
+            raise ValueError(f"{name!r} is not an object; write e.g. '0x6072' or '0x608F:01'")
     return value
 
 
 #: Values of objects, by "0xINDEX" or "0xINDEX:SUB".
-Objects = Annotated[dict[str, int], AfterValidator(_named_objects)]
+Objects = Annotated[dict[str, int], AfterValidator(_check_object_names)]
 
 
 def by_index(objects: dict[str, int]) -> dict[tuple[int, int], int]:
-    """The same by index and sub-index."""
-    found = {}
+    """Return the values of objects by index and sub-index instead of name."""
+    values = {}
     for name, value in objects.items():
         match = _OBJECT.fullmatch(name)
         assert match is not None
-        found[int(match[1], 16), int(match[2] or "0", 16)] = value
-    return found
+        values[int(match[1], 16), int(match[2] or "0", 16)] = value
+    return values
 
 
 class Drive(Section):
-    """`[drive]`: a node, its dictionary, and what the drive cannot say of itself."""
+    """`[drive]`: a node, its object dictionary, and values that the drive does not provide.
+
+    A key without a value is read from the drive. mode: "cst", "pt", or "auto" for the first of
+    them that the drive has. torque_pdo: a torque acts at the next SYNC, or on reception
+    ("immediate"). parameters: written at the set-up. download_dcf: write the values of the DCF
+    first. restore: undo all changes at the end. watchdog_s: silence of the master after which the
+    drive disables itself. wait_s: how long to wait for the drive to answer.
+    """
 
     node_id: int = Field(ge=1, le=127)
-    eds: Path
+    eds: FilePath
     mode: Literal["auto", "cst", "pt"] = "auto"
     torque_pdo: Literal["sync", "immediate"] = "sync"
     rated_torque_nm: Positive | None = None
@@ -49,12 +55,7 @@ class Drive(Section):
     accept_no_watchdog: bool = False
     wait_s: NonNegative = 5.0
 
-    @field_validator("eds", mode="before")
-    @classmethod
-    def _path(cls, value: object) -> object:
-        return Path(value) if isinstance(value, str) else value
-
     @property
-    def written(self) -> dict[tuple[int, int], int]:
+    def parameters_by_index(self) -> dict[tuple[int, int], int]:
         """`parameters` by index and sub-index."""
         return by_index(self.parameters)

@@ -2,11 +2,11 @@
 
 from typing import Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
-from canwall.config.section import NonNegative, Number, Positive, Section
+from canwall.config.section import Array, NonNegative, Number, Positive, Section
 
-#: Keys that a move of a script has to have, and those that it may have, beside duration_s.
+#: Required and optional keys of each move of a script, besides duration_s.
 _KEYS = {
     "rest": ((), ()),
     "approach": (("position_rad",), ()),
@@ -17,11 +17,12 @@ _KEYS = {
 
 
 class Move(Section):
-    """`[[simulation.hand.script]]`: one move, from where the one before has left the hand.
+    """`[[simulation.hand.script]]`: one move, from the end of the move before.
 
-    rest: stays as it is. approach: goes to position_rad. press: its muscle goes to torque_nm (and
-    the hand to position_rad). tap: goes to position_rad and back, in half the time each. release:
-    the muscle lets go, and the hand goes to position_rad (rest_rad, unless given).
+    rest: the hand stays as it is. approach: it moves to position_rad. press: its muscle torque goes
+    to torque_nm, and the hand to position_rad if given. tap: to position_rad and back, in half the
+    time each. release: the muscle torque goes to zero, and the hand to position_rad, by default
+    rest_rad.
     """
 
     move: Literal["rest", "approach", "press", "tap", "release"]
@@ -42,24 +43,19 @@ class Move(Section):
 
 
 class RandomStrikes(Section):
-    """`[simulation.hand.random]`: strikes drawn from a seed, each quantity evenly from its range.
+    """`[simulation.hand.random]`: random strikes, each quantity uniformly from its range.
 
     Before each strike the hand rests for pause_s. The same seed gives the same strikes.
     """
 
     seed: int = Field(0, ge=0)
     strikes: int = Field(10, ge=1, le=100_000)
-    pause_s: tuple[Positive, Positive] = (0.2, 0.6)
-    approach_s: tuple[Positive, Positive] = (0.05, 0.2)
-    press_s: tuple[Positive, Positive] = (0.2, 0.5)
-    withdraw_s: tuple[Positive, Positive] = (0.05, 0.2)
-    press_rad: tuple[Number, Number] = (-0.15, -0.05)
-    press_torque_nm: tuple[Number, Number] = (0.0, 0.0)
-
-    @field_validator("*", mode="before")
-    @classmethod
-    def _range(cls, value: object) -> object:
-        return tuple(value) if isinstance(value, list) else value
+    pause_s: Array[tuple[Positive, Positive]] = (0.2, 0.6)
+    approach_s: Array[tuple[Positive, Positive]] = (0.05, 0.2)
+    press_s: Array[tuple[Positive, Positive]] = (0.2, 0.5)
+    withdraw_s: Array[tuple[Positive, Positive]] = (0.05, 0.2)
+    press_rad: Array[tuple[Number, Number]] = (-0.15, -0.05)
+    press_torque_nm: Array[tuple[Number, Number]] = (0.0, 0.0)
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -71,11 +67,10 @@ class RandomStrikes(Section):
 
 
 class Hand(Section):
-    """`[simulation.hand]`: a mass, spring and damper about a hand that strikes by script.
+    """`[simulation.hand]`: a mass, spring and damper about a hand that moves by script.
 
-    Without `script` and `random` it strikes `strikes` times, each like the other. With `grip` the
-    hand holds the handle; without, it presses towards the side on which press_rad lies from
-    rest_rad, and can lose it.
+    Without `script` and `random` it makes `strikes` identical strikes. With `grip` it holds the
+    handle; without, it only presses, from rest_rad towards press_rad, and can lose the handle.
     """
 
     inertia_kg_m2: NonNegative = 6.4e-5
@@ -91,18 +86,13 @@ class Hand(Section):
     press_s: NonNegative = 0.5
     withdraw_s: Positive = 0.1
     grip: bool = True
-    script: tuple[Move, ...] = ()
+    script: Array[tuple[Move, ...]] = ()
     random: RandomStrikes | None = None
-
-    @field_validator("script", mode="before")
-    @classmethod
-    def _moves(cls, value: object) -> object:
-        return tuple(value) if isinstance(value, list) else value
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
         lasts = self.approach_s + self.press_s + self.withdraw_s
-        # Strikes may follow one another without a rest: 0.1 + 0.1 + 0.1 fits into 0.3.
+        # The tolerance is for rounding: 0.1 + 0.1 + 0.1 has to fit into 0.3.
         if self.strikes > 1 and lasts > self.interval_s * (1.0 + 1e-9):
             raise ValueError(
                 f"a strike lasts {lasts:g} s (approach_s + press_s + withdraw_s) and does not fit "
@@ -111,12 +101,14 @@ class Hand(Section):
         if self.script and self.random is not None:
             raise ValueError("script and random are given; keep one of them")
         if not self.grip and self.press_rad == self.rest_rad:
-            raise ValueError("grip = false: press_rad has to differ from rest_rad, to give a side")
+            raise ValueError(
+                "grip = false: press_rad has to differ from rest_rad, to give the hand a side"
+            )
         if not self.grip and self.inertia_kg_m2 == 0.0:
             raise ValueError("grip = false: inertia_kg_m2 has to be greater than 0")
         return self
 
     @property
     def side(self) -> float:
-        """Towards which it presses: 1.0 or -1.0."""
+        """Direction in which it presses: 1.0 or -1.0."""
         return 1.0 if self.press_rad > self.rest_rad else -1.0

@@ -1,4 +1,4 @@
-"""From the file to the settings, or to the one line that says what is wrong with it."""
+"""Reading of a configuration: from the file to settings, or to one line about its first error."""
 
 import difflib
 import math
@@ -17,17 +17,17 @@ class ConfigError(InputError):
     """A configuration that cannot be used."""
 
 
-# Lengths and forces at a handle of radius r are angles and torques at its shaft: [wall] may be
-# written in either. The exponent of r takes the metric value to the angular one.
-_AT_THE_HANDLE = {
+# [wall] may be written with lengths and forces at a handle of radius r instead of angles and
+# torques at its shaft: the metric key, its angular one, and the exponent of r between them.
+_METRIC_KEYS = {
     "position_m": ("position_rad", -1),
     "stiffness_n_per_m": ("stiffness_nm_per_rad", 2),
     "damping_n_s_per_m": ("damping_nm_s_per_rad", 2),
 }
 
 
-def _at_the_shaft(raw: dict[str, Any]) -> None:
-    """Turn what is written at the handle; what is of the wrong type is left to the validation."""
+def _convert_metric_keys(raw: dict[str, Any]) -> None:
+    """Convert metric keys to angular ones; values of a wrong type are left to the validation."""
     mechanics, schedule = raw.get("mechanics"), raw.get("schedule")
     radius = mechanics.get("handle_radius_m") if isinstance(mechanics, dict) else None
     if not isinstance(radius, int | float) or not radius > 0:
@@ -37,21 +37,28 @@ def _at_the_shaft(raw: dict[str, Any]) -> None:
     for name, section in sections.items():
         if not isinstance(section, dict):
             continue
-        for metric, (angular, exponent) in _AT_THE_HANDLE.items():
+        for metric, (angular, exponent) in _METRIC_KEYS.items():
             if metric not in section:
                 continue
             if angular in section:
                 raise ConfigError(f"{name}.{metric}: {angular} is given as well; keep one of them")
             value = section.pop(metric)
             if isinstance(value, bool) or not isinstance(value, int | float):
-                raise ConfigError(f"{name}.{metric}: has to be a valid number, not {_shown(value)}")
+                raise ConfigError(
+                    f"{name}.{metric}: has to be a valid number, not {_format(value)}"
+                )
             section[angular] = value * float(radius) ** exponent
 
 
 def load(path: Path, overrides: Mapping[str, Any] | None = None) -> Settings:
-    """Read and validate a TOML file; `overrides` maps dotted keys to values that go first.
+    """Read and validate a TOML file.
 
-    Paths in the file are relative to the file. Raises ConfigError.
+    Args:
+        path: The file; paths in it are relative to it.
+        overrides: Values by dotted key, "wall.law", that replace those of the file.
+
+    Raises:
+        ConfigError: If the file cannot be read or is not valid.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -64,7 +71,7 @@ def load(path: Path, overrides: Mapping[str, Any] | None = None) -> Settings:
     except ValueError as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from None
     try:
-        _at_the_shaft(raw)
+        _convert_metric_keys(raw)
         for dotted, value in (overrides or {}).items():
             section, key = dotted.split(".")
             table = raw.setdefault(section, {})
@@ -79,7 +86,7 @@ def load(path: Path, overrides: Mapping[str, Any] | None = None) -> Settings:
 
 
 def overridden(settings: Settings, values: Mapping[str, Any]) -> Settings:
-    """The settings with other values under dotted keys, validated anew. Raises ConfigError."""
+    """Return the settings with other values by dotted key, validated again. Raises ConfigError."""
     raw = settings.model_dump()
     for dotted, value in values.items():
         *sections, key = dotted.split(".")
@@ -97,7 +104,7 @@ def overridden(settings: Settings, values: Mapping[str, Any]) -> Settings:
 
 
 def _with_absolute_paths(settings: Settings, base: Path) -> Settings:
-    """The files that a configuration names, independent of where it lies."""
+    """Resolve the paths in a configuration relative to the folder `base`."""
     drive = settings.drive.model_copy(update={"eds": (base / settings.drive.eds).resolve()})
     laws = {
         "law": absolute_law(settings.wall.law, base),
@@ -126,13 +133,13 @@ def _with_absolute_paths(settings: Settings, base: Path) -> Settings:
 
 
 def absolute_law(law: str, base: Path) -> str:
-    """A law's name; where it names a user's file, that file's path no longer relative to base."""
+    """Return the name of a law; the path in FILE.py:FUNCTION is resolved relative to `base`."""
     path, colon, function = law.rpartition(":")
     return f"{(base / path).resolve()}:{function}" if colon else law
 
 
-# What the validation calls by the names of Python, in those of TOML.
-_IN_TOML = {
+# Types as TOML calls them, by the errors in which pydantic names those of Python.
+_TOML_TYPES = {
     "model_type": "a table",
     "dict_type": "a table",
     "tuple_type": "an array",
@@ -142,7 +149,7 @@ _IN_TOML = {
 
 
 def first_error(error: ValidationError, model: type[BaseModel] = Settings) -> str:
-    """One line for the first thing that is wrong: key, what, what to do."""
+    """Return one line about the first error: key, what is wrong, what to do."""
     first = error.errors()[0]
     where = [str(part) for part in first["loc"]]
     key = ".".join(where)
@@ -156,10 +163,10 @@ def first_error(error: ValidationError, model: type[BaseModel] = Settings) -> st
         return message
     if first["type"] == "value_error":
         return f"{key}: {message}"
-    return f"{key}: has to be {_IN_TOML.get(first['type'], message)}, not {_shown(given)}"
+    return f"{key}: has to be {_TOML_TYPES.get(first['type'], message)}, not {_format(given)}"
 
 
-def _shown(value: object) -> str:
+def _format(value: object) -> str:
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     return repr(value) if isinstance(value, str | int | float | bool) else type(value).__name__
@@ -173,14 +180,14 @@ def _suggestion(where: list[str], model: Any) -> str:
         candidates = [annotation, *get_args(annotation)]
         model = next(c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel))
     known = list(model.model_fields)
-    if where[-1] in _AT_THE_HANDLE:
+    if where[-1] in _METRIC_KEYS:
         return "; lengths and forces at the handle need mechanics.handle_radius_m"
     close = difflib.get_close_matches(where[-1], known, n=1, cutoff=0.5)
     return f"; did you mean {close[0]}?" if close else f"; known here: {', '.join(known)}"
 
 
 def shipped(relative: str) -> Path:
-    """A file that comes with the project, e.g. `config/sim.toml`, in a checkout or installed."""
+    """Return the path of a file of the project, e.g. `config/sim.toml`, installed or not."""
     package = Path(__file__).resolve().parents[1]
     installed = package / "data" / relative
     return installed if installed.exists() else package.parent / relative

@@ -1,14 +1,22 @@
-"""The base of every section of a configuration: strict, frozen, its numbers finite."""
+"""Base of every section of a configuration, and the types that TOML writes in its own way."""
 
 import math
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, create_model
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    create_model,
+)
 
 
 class Section(BaseModel):
-    """One table of the file."""
+    """One table of the file: immutable, without unknown keys, its numbers finite."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
@@ -42,8 +50,8 @@ def changing(section: type[Section], keys: Iterable[str]) -> Callable[[type[_C]]
     return with_keys
 
 
-# TOML writes a whole number without a point: `cycle_s = 1` is meant as 1.0.
-def _number(value: object) -> object:
+# A number may be written without a decimal point: `cycle_s = 1` means 1.0.
+def _float(value: object) -> object:
     if isinstance(value, bool) or not isinstance(value, int):
         return value
     try:
@@ -52,11 +60,28 @@ def _number(value: object) -> object:
         return math.inf
 
 
-def _array(value: object) -> object:
+def _tuple(value: object) -> object:
     return tuple(value) if isinstance(value, list) else value
 
 
-Names = Annotated[tuple[str, ...], BeforeValidator(_array)]
-Number = Annotated[float, BeforeValidator(_number)]
+def _path(value: object) -> object:
+    return Path(value) if isinstance(value, str) else value
+
+
+def _ordered(value: tuple[float, float]) -> tuple[float, float]:
+    if not value[0] < value[1]:
+        raise ValueError("the lower value has to come first and lie below the upper one")
+    return value
+
+
+_T = TypeVar("_T")
+
+#: An array, which TOML reads as a list, as an immutable tuple.
+Array = Annotated[_T, BeforeValidator(_tuple)]
+Names = Array[tuple[str, ...]]
+FilePath = Annotated[Path, BeforeValidator(_path)]
+Number = Annotated[float, BeforeValidator(_float)]
 Positive = Annotated[Number, Field(gt=0)]
 NonNegative = Annotated[Number, Field(ge=0)]
+#: Two numbers, the lower one first.
+Interval = Annotated[Array[tuple[Number, Number]], AfterValidator(_ordered)]

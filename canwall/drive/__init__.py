@@ -1,6 +1,6 @@
-"""The master's side of CiA 301 and CiA 402: everything about a drive but the cycle itself.
+"""Master's side of CiA 301 and CiA 402: everything about a drive except the cycle.
 
-One python-can bus, one thread: what waits for an answer reads the bus itself.
+One python-can bus, one thread: code that waits for an answer reads the bus itself.
 """
 
 from canwall.drive.cia402 import (

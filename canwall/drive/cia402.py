@@ -1,6 +1,6 @@
-"""The CiA 402 state machine from the master's side: which controlword leads where.
+"""State machine of CiA 402 from the master's side: controlwords by state.
 
-Pure functions of the statusword, so they serve a cycle as well as a set-up over SDO.
+Pure functions of the statusword, for a cycle as well as for a set-up over SDO.
 """
 
 from enum import Enum, IntEnum
@@ -33,8 +33,8 @@ class Controlword(IntEnum):
     FAULT_RESET = 0x80
 
 
-#: Statusword bits beside those of the state, with their names in CiA 402-2; 12 and 13 depend on
-#: the mode, 8, 14 and 15 on the maker.
+#: Statusword bits besides those of the state, with their names in CiA 402-2; 12 and 13 depend on
+#: the mode, 8, 14 and 15 on the manufacturer.
 _BITS = {
     4: "voltage enabled",
     7: "warning",
@@ -50,19 +50,19 @@ _BITS = {
 
 
 def state_of(statusword: int) -> DriveState:
-    """The state that a statusword (0x6041) shows."""
+    """Return the state in a statusword (0x6041)."""
     for state in DriveState:
         mask, value = state.value
         if statusword & mask == value:
             return state
-    return DriveState.NOT_READY_TO_SWITCH_ON  # no other is left
+    return DriveState.NOT_READY_TO_SWITCH_ON  # other values do not occur
 
 
 def status_text(statusword: int) -> str:
-    """DriveState and bits of a statusword, for people."""
+    """Return state and bits of a statusword as text."""
     bits = [name for bit, name in _BITS.items() if statusword >> bit & 1]
-    said = f": {', '.join(bits)}" if bits else ""
-    return f"{state_of(statusword)} (statusword {statusword:#06x}{said})"
+    listed = f": {', '.join(bits)}" if bits else ""
+    return f"{state_of(statusword)} (statusword {statusword:#06x}{listed})"
 
 
 _UP = {
@@ -71,8 +71,8 @@ _UP = {
     DriveState.READY_TO_SWITCH_ON: Controlword.SWITCH_ON,
     DriveState.SWITCHED_ON: Controlword.ENABLE_OPERATION,
     DriveState.OPERATION_ENABLED: Controlword.ENABLE_OPERATION,
-    # Transition 16 back to OPERATION ENABLED is optional; through SWITCH ON DISABLED every drive
-    # goes.
+    # Transition 16 back to OPERATION ENABLED is optional; the way through SWITCH ON DISABLED is
+    # not.
     DriveState.QUICK_STOP_ACTIVE: Controlword.DISABLE_VOLTAGE,
     DriveState.FAULT_REACTION_ACTIVE: Controlword.DISABLE_VOLTAGE,
     DriveState.FAULT: Controlword.FAULT_RESET,
@@ -85,9 +85,9 @@ _DOWN = {
 
 
 def controlword_up(state: DriveState, previous: int) -> int:
-    """Next controlword on the way to OPERATION ENABLED, from any state.
+    """Return the next controlword on the way to OPERATION ENABLED, from any state.
 
-    The fault reset acts on the rising edge of bit 7, so it alternates with a word without it.
+    A fault reset acts on the rising edge of bit 7, so it alternates with a word without the bit.
     """
     if state is DriveState.FAULT and previous & Controlword.FAULT_RESET:
         return Controlword.DISABLE_VOLTAGE
@@ -95,19 +95,16 @@ def controlword_up(state: DriveState, previous: int) -> int:
 
 
 def controlword_down(state: DriveState) -> int:
-    """Next controlword on the way to SWITCH ON DISABLED, from any state, step by step."""
+    """Return the next controlword on the way to SWITCH ON DISABLED, from any state."""
     return _DOWN.get(state, Controlword.DISABLE_VOLTAGE)
 
 
-#: Resets after which a fault that comes back is taken for one that stays.
+#: Resets after which a fault that returns is considered permanent.
 _RESETS = 3
 
 
 class Enabling:
-    """The way to OPERATION ENABLED from any state, one statusword and controlword at a time.
-
-    Serves a cycle as well as SDO: whoever has a new statusword asks for the next controlword.
-    """
+    """Way to OPERATION ENABLED from any state, a controlword for each new statusword."""
 
     def __init__(self) -> None:
         self._controlword: int = Controlword.DISABLE_VOLTAGE
@@ -115,7 +112,7 @@ class Enabling:
         self._faulty = False
 
     def next(self, statusword: int) -> int:
-        """Controlword to send now. HALT and every other stale bit are clear in all of them."""
+        """Return the controlword to send now, in which HALT and all other stale bits are clear."""
         state = state_of(statusword)
         faulty = state is DriveState.FAULT
         if faulty and not self._faulty:
@@ -126,5 +123,5 @@ class Enabling:
 
     @property
     def gave_up(self) -> bool:
-        """Whether the fault has come back after as many resets as make sense."""
+        """True if the fault has returned after _RESETS resets."""
         return self._resets > _RESETS

@@ -1,4 +1,4 @@
-"""Who answers: device type and identity (0x1000, 0x1018), against what the dictionary expects."""
+"""Identity of a drive: device type and 0x1018, compared with its object dictionary."""
 
 from dataclasses import dataclass
 
@@ -7,13 +7,19 @@ from canwall.drive.node import DriveError, DriveNode
 
 _DRIVE_PROFILE = 402
 _PARTS = {1: "vendor-ID", 2: "product code", 3: "revision number", 4: "serial number"}
-#: What has to be the dictionary's for it to be this drive's at all.
+#: Parts that differ if the dictionary is another drive's.
 _VENDOR, _PRODUCT = 1, 2
 
 
 @dataclass(frozen=True)
 class Identity:
-    """Device type, and sub-indices of 0x1018 that the drive has; doubts about the dictionary."""
+    """Identity of a drive.
+
+    Attributes:
+        device_type: 0x1000.
+        numbers: Values in 0x1018, by sub-index.
+        doubts: Lines about disagreements with the object dictionary.
+    """
 
     device_type: int
     numbers: dict[int, int]
@@ -25,7 +31,7 @@ class Identity:
 
 
 def identify(node: DriveNode) -> Identity:
-    """Read who it is. Raises DriveError for a device that says it is no drive."""
+    """Read the identity. Raises DriveError if the device has another profile than CiA 402."""
     device_type = node.read(od.DEVICE_TYPE)
     profile = device_type & 0xFFFF
     if profile not in (_DRIVE_PROFILE, 0):
@@ -36,7 +42,7 @@ def identify(node: DriveNode) -> Identity:
     numbers = {i: node.read(od.IDENTITY, i) for i in _PARTS if node.has(od.IDENTITY, i)}
     doubts = []
     if not profile:
-        doubts.append("0x1000 names no device profile: taken for a drive")
+        doubts.append("0x1000 names no device profile: assumed to be a drive")
     for part in (_VENDOR, _PRODUCT):
         variable = node.dictionary.get_variable(od.IDENTITY, part)
         expected = variable.default if variable is not None else None

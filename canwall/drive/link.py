@@ -1,8 +1,8 @@
-"""One bus for everything the master says and hears: cycle, SDO, NMT, EMCY, in one thread.
+"""Link of the master to its bus: cycle, SDO, NMT and EMCY in one thread.
 
-canopen's Network usually receives in a thread of its own, which costs the cycle its timing.
-Here whoever waits for a frame reads the bus, and hands what is not his to the network; so SDO
-transfers and the cycle need no lock and no second thread.
+canopen's Network receives in a thread of its own, which disturbs the timing of the cycle. Here,
+code that waits for a frame reads the bus itself and passes other frames to the network, so SDO
+transfers and the cycle need neither a lock nor a second thread.
 """
 
 import contextlib
@@ -20,26 +20,32 @@ from canopen.sdo.exceptions import SdoCommunicationError
 from canwall.bus.errors import explained
 from canwall.bus.raw_socket import QUEUE_PATIENCE_NS, QUEUE_RETRY_NS, CFunction
 
-# What fails is raised; canopen logs it as well, which without a handler goes to stderr.
+# Failures are raised; without a handler, canopen would also log them to standard error.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
 
-#: What an SDO server answers to what, by command specifier: download segment, initiate download,
-#: initiate upload, upload segment; and the abort (CiA 301, 7.2.4.3).
+#: Command specifier of an SDO answer by that of the request: download segment, initiate download,
+#: initiate upload, upload segment (CiA 301, 7.2.4.3); and that of an abort.
 _ANSWERS = {0: 1, 1: 3, 2: 2, 3: 0}
 _ABORT = 4
 #: Requests whose answer repeats index and subindex.
 _INITIATE = (1, 2)
 
-#: Takes note of a frame: time [s], message, whether it was received (else sent).
+#: Logs a frame: time [s], message, True if it was received, False if it was sent.
 FrameLog = Callable[[float, can.Message, bool], None]
 
 
 class Link:
     """A python-can bus with canopen's network on it.
 
-    idle: what to do while nothing is waiting on the bus, instead of blocking. An embedded
-    simulated drive lives in these moments. compiled_idle: a C function that does the same for
-    compiled code, and returns 0 where idle is to be called after all.
+    Attributes:
+        bus: The bus.
+        idle: Called instead of blocking while no frame is waiting; an embedded simulated drive
+            runs in it.
+        compiled_idle: A C function that does the same for compiled code, and returns 0 if idle has
+            to be called after all.
+        log: Called with every frame.
+        on_error_frame: Called with every error frame.
+        network: canopen's network.
     """
 
     def __init__(
@@ -71,7 +77,7 @@ class Link:
             self._send_when_there_is_room(message)
 
     def _send_when_there_is_room(self, message: can.Message) -> None:
-        # python-can gives up at once: such a socket always seems ready to be written.
+        # python-can gives up at once, because the socket always polls as writable.
         deadline_ns = time.monotonic_ns() + QUEUE_PATIENCE_NS
         while True:
             time.sleep(QUEUE_RETRY_NS * 1e-9)
@@ -108,7 +114,10 @@ class Link:
             self.idle()
 
     def wait_for(self, can_ids: Container[int], timeout_s: float) -> can.Message | None:
-        """The next data frame with one of these identifiers; others go to the network."""
+        """Return the next data frame with one of these identifiers, None if there is none.
+
+        Other frames go to the network. Raises can.CanError.
+        """
         deadline = time.monotonic() + timeout_s
         remaining = timeout_s
         while True:
@@ -121,37 +130,37 @@ class Link:
             remaining = max(0.0, deadline - time.monotonic())
 
     def dispatch(self, message: can.Message) -> None:
-        """Hand a frame to canopen (SDO answers, heartbeats, EMCY); malformed ones are ignored."""
+        """Pass a frame to canopen (SDO answers, heartbeats, EMCY); ignore a malformed one."""
         if message.is_error_frame:
             if self.on_error_frame is not None:
                 self.on_error_frame(message)
             return
         if not _carries_data(message):
             return
-        # Somebody's heartbeat without data, or EMCY too short, is not to end the cycle.
+        # An empty heartbeat or a short EMCY of another node must not end the cycle.
         with contextlib.suppress(struct.error):
             self.network.notify(message.arbitration_id, message.data, message.timestamp)
 
     def serve(self, timeout_s: float) -> bool:
-        """Take one frame for the network; whether there was one within the time."""
+        """Receive one frame for the network; return False if there was none within the time."""
         message = self.receive(timeout_s)
         if message is not None:
             self.dispatch(message)
         return message is not None
 
     def add_node(self, node_id: int, dictionary: canopen.ObjectDictionary) -> canopen.RemoteNode:
-        """A remote node whose SDO transfers read this link."""
+        """Add a remote node whose SDO transfers read this link."""
         return self.network.add_node(_Node(node_id, dictionary, self))
 
     def close(self) -> None:
-        """Leave the bus."""
+        """Close the bus."""
         self.bus.shutdown()
 
 
 def _carries_data(message: can.Message) -> bool:
-    """Whether it is a data frame, its identifier of 11 bits where these are enough.
+    """Return True for a data frame, except for one with a small identifier of 29 bits.
 
-    A short number in an identifier of 29 bits is another identifier than that number in 11 bits.
+    Such an identifier would be mistaken for the 11-bit identifier of the same number.
     """
     return not (
         message.is_remote_frame
@@ -161,7 +170,7 @@ def _carries_data(message: can.Message) -> bool:
 
 
 class _Network(canopen.Network):  # type: ignore[misc]
-    """canopen's network without a receive thread: its frames go through the link."""
+    """canopen's network without its receive thread; it sends through the link."""
 
     def __init__(self, link: Link) -> None:
         super().__init__()
@@ -194,7 +203,7 @@ class _Node(canopen.RemoteNode):  # type: ignore[misc]
 
 
 class _Sdo(SdoClient):  # type: ignore[misc]
-    """canopen's SDO client, reading the bus itself while it waits."""
+    """canopen's SDO client, which reads the bus itself while it waits."""
 
     def __init__(self, rx: int, tx: int, dictionary: canopen.ObjectDictionary, link: Link) -> None:
         super().__init__(rx, tx, dictionary)
@@ -206,7 +215,7 @@ class _Sdo(SdoClient):  # type: ignore[misc]
         super().send_request(request)
 
     def on_response(self, can_id: int, data: bytearray, timestamp: float) -> None:
-        # What comes too late for the request before, or for another master, answers nothing.
+        # Ignore an answer that is late for an earlier request, or meant for another master.
         if len(data) == 8 and self._answers(data):
             super().on_response(can_id, data, timestamp)
 

@@ -1,4 +1,4 @@
-"""Which torque mode: cyclic synchronous torque, else profile torque, and why."""
+"""Selection of the torque mode: cyclic synchronous torque, else profile torque."""
 
 import time
 from dataclasses import dataclass
@@ -17,20 +17,20 @@ _NAMES = {
 }
 _SWITCHING_S = 0.5
 
-#: 0x6087 [per mille of the rated torque per second]: the greatest a drive may take, downwards.
+#: Values tried for 0x6087, from the greatest down [per mille of the rated torque per second].
 _SLOPES = (0xFFFF_FFFF, 0x7FFF_FFFF, 100_000_000, 10_000_000, 1_000_000)
 
 
 @dataclass(frozen=True)
 class Mode:
-    """A mode of operation (0x6060) that the drive confirmed (0x6061), and why it is this one."""
+    """A mode of operation (0x6060) that the drive confirmed (0x6061), and why it was chosen."""
 
     number: int
     why: str
 
     @property
     def name(self) -> str:
-        """Its name in CiA 402."""
+        """Name of the mode in CiA 402."""
         return _NAMES[self.number]
 
     def __str__(self) -> str:
@@ -38,15 +38,21 @@ class Mode:
 
 
 def select_mode(node: DriveNode, wanted: str) -> Mode:
-    """Set the best torque mode that the drive has and take its word for it (0x6061).
+    """Set the best torque mode that the drive has and confirms (0x6061).
 
-    wanted: "auto", "cst" or "pt". 0x6502 says which there are; where it names no torque mode
-    (some vendors leave the bits out), or the mode was asked for by name, it is tried. Raises
-    DriveError.
+    The modes are those of 0x6502. If it lists no torque mode (some vendors leave the bits out), or
+    if the mode is given by name, it is tried.
+
+    Args:
+        node: The drive.
+        wanted: `[drive] mode`: "auto", "cst" or "pt".
+
+    Raises:
+        DriveError: If the drive takes no mode.
     """
     candidates = _CANDIDATES[wanted]
-    said = node.read(od.SUPPORTED_DRIVE_MODES) if node.has(od.SUPPORTED_DRIVE_MODES) else None
-    listed = [mode for mode in _NAMES if said is not None and said >> (mode - 1) & 1]
+    supported = node.read(od.SUPPORTED_DRIVE_MODES) if node.has(od.SUPPORTED_DRIVE_MODES) else None
+    listed = [mode for mode in _NAMES if supported is not None and supported >> (mode - 1) & 1]
     if wanted == "auto" and listed:
         candidates = tuple(mode for mode in candidates if mode in listed)
     reasons = []
@@ -59,27 +65,28 @@ def select_mode(node: DriveNode, wanted: str) -> Mode:
         except DriveError as error:
             reasons.append(str(error))
             continue
-        return Mode(mode, "; ".join([_evidence(said, mode, listed, wanted), *reasons]))
+        return Mode(mode, "; ".join([_evidence(supported, mode, listed, wanted), *reasons]))
     raise DriveError(f"{'; '.join(reasons)}: no torque mode, so this drive cannot render a wall")
 
 
-def _evidence(said: int | None, mode: int, listed: list[int], wanted: str) -> str:
-    if said is None:
-        text = "there is no 0x6502; the drive took the mode when it was tried"
+def _evidence(supported: int | None, mode: int, listed: list[int], wanted: str) -> str:
+    """Return the reason for choosing a mode."""
+    if supported is None:
+        text = "there is no 0x6502; the drive accepted the mode when it was tried"
     elif mode not in listed:
         lists = "does not list it" if listed else "lists no torque mode"
-        text = f"0x6502 = {said:#x} {lists}, yet the drive took it when it was tried"
+        text = f"0x6502 = {supported:#x} {lists}, yet the drive accepted it when it was tried"
     elif mode == od.PROFILE_TORQUE and od.CYCLIC_SYNCHRONOUS_TORQUE not in listed:
-        text = f"0x6502 = {said:#x} lists it, and not cyclic synchronous torque"
+        text = f"0x6502 = {supported:#x} lists it, and not cyclic synchronous torque"
     else:
-        text = f"0x6502 = {said:#x} lists it"
+        text = f"0x6502 = {supported:#x} lists it"
     return text if wanted == "auto" else f'drive.mode = "{wanted}"; {text}'
 
 
 def enter_mode(node: DriveNode, mode: int) -> None:
     """Set 0x6060 and wait until 0x6061 shows it. Raises DriveError."""
     node.change(od.MODES_OF_OPERATION, 0, mode)
-    # The display follows when the drive has switched, which may take it a while.
+    # The display follows once the drive has switched, which may take some time.
     deadline = time.monotonic() + _SWITCHING_S
     while True:
         shown = node.read(od.MODES_OF_OPERATION_DISPLAY)
@@ -92,9 +99,9 @@ def enter_mode(node: DriveNode, mode: int) -> None:
 
 
 def steepest_slope(node: DriveNode) -> int:
-    """Set 0x6087 to the greatest that the drive takes, so that the torque follows at once.
+    """Set 0x6087 to the greatest value that the drive accepts, so that the torque follows at once.
 
-    Returns it [per mille of the rated torque per second]. Raises DriveError.
+    Returns the value [per mille of the rated torque per second]. Raises DriveError.
     """
     variable = node.dictionary.get_variable(od.TORQUE_SLOPE, 0)
     greatest = None if variable is None else variable.max

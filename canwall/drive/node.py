@@ -1,4 +1,4 @@
-"""One drive as its master talks to it outside the cycle: SDO values, NMT, EMCY, heartbeat."""
+"""A drive as seen by its master outside the cycle: objects over SDO, NMT and EMCY."""
 
 import time
 from collections.abc import Iterator
@@ -14,11 +14,11 @@ from canwall.errors import RunFailedError
 
 
 class DriveError(RunFailedError):
-    """A drive that does not do what it was asked."""
+    """A drive that does not answer, refuses a value, or stays in a state."""
 
 
 class DriveNode:
-    """A node on the bus, its objects by index."""
+    """A node on the bus, with its objects by index and sub-index."""
 
     def __init__(self, link: Link, node_id: int, dictionary: ObjectDictionary) -> None:
         self.link = link
@@ -29,20 +29,20 @@ class DriveNode:
 
     @property
     def emergencies(self) -> list[EmcyError]:
-        """EMCY messages so far, the latest last."""
+        """EMCY messages so far, in order of arrival."""
         log: list[EmcyError] = self._node.emcy.log
         return log
 
     def has(self, index: int, subindex: int = 0) -> bool:
-        """Whether the object dictionary lists this object."""
+        """Return whether the object dictionary lists this object."""
         item = self.dictionary.get(index)
         if item is None or isinstance(item, ODVariable):
             return item is not None and subindex == 0
-        # Asked by [], an array of canopen's makes up the sub-indices that it does not have.
+        # By [] an array of canopen's would make up sub-indices that it does not have.
         return subindex in item.subindices
 
-    def configured(self) -> Iterator[ODVariable]:
-        """The objects to which a DCF gives a value of its own (ParameterValue)."""
+    def dcf_objects(self) -> Iterator[ODVariable]:
+        """Yield the objects to which a DCF gives a value (ParameterValue)."""
         for item in self.dictionary.values():
             variables = [item] if isinstance(item, ODVariable) else item.subindices.values()
             for variable in variables:
@@ -50,14 +50,14 @@ class DriveNode:
                     yield variable
 
     def read(self, index: int, subindex: int = 0) -> int:
-        """Upload an integer. Raises DriveError."""
+        """Read an integer. Raises DriveError."""
         raw = self._upload(index, subindex)
         variable = self.dictionary.get_variable(index, subindex)
         signed = variable is not None and variable.data_type in datatypes.SIGNED_TYPES
         return int.from_bytes(raw, "little", signed=signed)
 
     def write(self, index: int, subindex: int, value: int, size: int | None = None) -> None:
-        """Download an integer; its size in bytes is the dictionary's unless given.
+        """Write an integer; its size in bytes is the dictionary's unless given.
 
         Raises DriveError.
         """
@@ -69,13 +69,13 @@ class DriveNode:
         try:
             raw = value.to_bytes(size, "little", signed=value < 0)
         except OverflowError:
-            raise DriveError(f"{_name(index, subindex)}: {value:#x} has no room in it") from None
+            raise DriveError(f"{_name(index, subindex)}: {value:#x} does not fit into it") from None
         self._download(index, subindex, raw)
 
     def change(self, index: int, subindex: int, value: int, size: int | None = None) -> None:
-        """Write a parameter, and remember what `restore` has to undo. Raises DriveError.
+        """Write a parameter, and remember its old value for `restore`. Raises DriveError.
 
-        What cannot be read cannot be undone, but can be written.
+        A parameter that cannot be read is written as well, but cannot be restored.
         """
         try:
             before = self._upload(index, subindex)
@@ -85,12 +85,12 @@ class DriveNode:
         self._changes.append((index, subindex, before))
 
     def set(self, index: int, subindex: int, value: int) -> None:
-        """Change a parameter, read back, compare. Raises DriveError."""
+        """Change a parameter and confirm its value. Raises DriveError."""
         self.change(index, subindex, value)
         self.confirm(index, subindex, value)
 
     def confirm(self, index: int, subindex: int, value: int) -> None:
-        """Read back what was written. Raises DriveError where the drive has something else."""
+        """Read a value back. Raises DriveError if the drive has another one."""
         found = self.read(index, subindex)
         if found != value:
             raise DriveError(
@@ -99,32 +99,32 @@ class DriveNode:
             )
 
     def restore(self) -> list[str]:
-        """Undo every change, the last one first, in PRE-OPERATIONAL; what could not be undone.
+        """Undo all changes in PRE-OPERATIONAL and return a line for each that could not be undone.
 
-        In this order a PDO is switched off before its mapping is touched, as it was on the way in.
+        The last change is undone first, so that a PDO is switched off before its mapping changes.
         """
         try:
             self.command("PRE-OPERATIONAL")
         except can.CanError as error:
-            return [f"node {self.node_id}: nothing was put back, the bus failed: {error}"]
-        failed = []
+            return [f"node {self.node_id}: nothing was restored, the bus failed: {error}"]
+        failures = []
         while self._changes:
             index, subindex, before = self._changes.pop()
             if before is None:
-                failed.append(f"{_name(index, subindex)} cannot be read, so not be put back")
+                failures.append(f"{_name(index, subindex)} cannot be read, so it is not restored")
                 continue
             try:
                 self._download(index, subindex, before)
             except DriveError as error:
-                failed.append(str(error))
-        return failed
+                failures.append(str(error))
+        return failures
 
     def command(self, nmt: str) -> None:
-        """Send an NMT command to this node: START, PRE-OPERATIONAL … (canopen's names)."""
+        """Send an NMT command to this node, by canopen's name for it, e.g. PRE-OPERATIONAL."""
         self._node.nmt.state = nmt
 
     def wait_until_present(self, timeout_s: float) -> None:
-        """Ask for the device type until the drive answers. Raises DriveError."""
+        """Read the device type until the drive answers. Raises DriveError."""
         deadline = time.monotonic() + timeout_s
         while True:
             try:

@@ -1,4 +1,4 @@
-"""Indices of the objects that the master uses, under their names in CiA 301 and CiA 402."""
+"""Indices of the objects that the master uses, by their names in CiA 301 and CiA 402."""
 
 DEVICE_TYPE = 0x1000
 SYNC_COB_ID = 0x1005

@@ -1,4 +1,4 @@
-"""One master on a bus: two would set the drive up, and command its torque, against each other."""
+"""Detection of a second master, which would set up and command the same drive."""
 
 from collections.abc import Iterable
 
@@ -7,17 +7,20 @@ from canwall.config import Bus as BusSettings
 from canwall.drive.link import Link
 from canwall.drive.node import DriveError
 
-#: How long to listen, and how many periods of the SYNC at least.
+#: Time to listen, and its minimum in periods of the SYNC.
 _LISTEN_S = 0.25
 _LISTEN_CYCLES = 3.0
 
 
 def refuse_second_master(link: Link, bus: BusSettings, node_ids: Iterable[int]) -> None:
-    """Listen, without sending, for what only a master of these nodes sends.
+    """Listen, without sending, for frames that only a master of these nodes sends.
 
-    That is SYNC, where this master is to produce it, an RPDO of a node, and the heartbeat of
-    `[bus] master_id`. SDO is not among it: others may ask a drive. Raises DriveError where there
-    is such a master, can.CanError.
+    These are SYNC, if this master is to produce it, an RPDO of a node, and the heartbeat of
+    `[bus] master_id`; not SDO, with which others may read a drive.
+
+    Raises:
+        DriveError: If there is another master.
+        can.CanError: If the bus fails.
     """
     signs = {ERROR_CONTROL + bus.master_id: f"the heartbeat of node {bus.master_id}"}
     signs |= {RPDO1 + node_id: f"RPDO1 of node {node_id}" for node_id in node_ids}

@@ -1,4 +1,4 @@
-"""PDO set-up: mapping written in the order of CiA 301, read back, and laid out for the cycle.
+"""Set-up of the PDOs: mapping written in the order of CiA 301, read back, laid out for the cycle.
 
 A drive whose mapping cannot be written is used as it is, if one of its PDOs carries what the cycle
 needs.
@@ -17,11 +17,10 @@ _EXTENDED = 1 << 29
 _CAN_ID = 0x7FF
 _MAPPING_OFFSET = 0x200
 _MAX_BITS = 64
-#: Indices below are data types: a mapping of one skips its bits.
+#: Indices below are data types; a mapping entry with one is a gap.
 _FIRST_OBJECT = 0x1000
 
-#: Transmission types: with every SYNC; on reception (device and profile specific, then
-#: manufacturer specific).
+#: Transmission types: every SYNC; on reception (first profile, then manufacturer specific).
 EVERY_SYNC = 1
 ON_RECEPTION = (255, 254)
 _SYNCHRONOUS = range(0, 241)
@@ -31,12 +30,12 @@ _EVENT_TIMER = 5
 
 
 class MappingError(DriveError):
-    """A drive that maps something else than it was told, and says nothing of it."""
+    """A drive that accepts a mapping and then has another one."""
 
 
 @dataclass(frozen=True)
 class Field:
-    """Where an object lies in the data of a PDO, taken as one little-endian number."""
+    """Position of an object in the data of a PDO, read as one little-endian number."""
 
     index: int
     subindex: int
@@ -49,11 +48,14 @@ class Field:
 
 @dataclass(frozen=True)
 class PdoLayout:
-    """One PDO as the drive confirmed it: identifier, fields, length in bytes.
+    """One PDO as the drive confirmed it.
 
-    communication: index of its communication parameter.
-    constant: what an RPDO that the drive has fixed carries besides controlword and torque, as a
-    number that the cycle's own is or-ed with.
+    Attributes:
+        cob_id: CAN-ID.
+        fields: Mapped objects, in order.
+        communication: Index of its communication parameter.
+        constant: Values of the other objects in an RPDO with a fixed mapping, as a number that is
+            or-ed with controlword and torque.
     """
 
     cob_id: int
@@ -67,45 +69,59 @@ class PdoLayout:
         return (sum(field.bits for field in self.fields) + 7) // 8
 
     def field(self, index: int) -> Field | None:
-        """The field that carries this object (its sub-index 0), if the PDO has it."""
+        """Return the field of this object (sub-index 0), None if the PDO does not carry it."""
         return next((f for f in self.fields if (f.index, f.subindex) == (index, 0)), None)
 
     def carries(self, objects: Sequence[int]) -> bool:
-        """Whether all of these objects are in it."""
+        """Return whether the PDO carries all of these objects."""
         return all(self.field(index) is not None for index in objects)
 
 
 def configure_tpdo(
     node: DriveNode, needed: Sequence[int], wanted: Sequence[int], notes: list[str]
 ) -> PdoLayout:
-    """Have a TPDO send these objects on every SYNC, of those wanted as many as it has room for.
+    """Set up a TPDO with these objects, sent with every SYNC.
 
-    notes takes what the drive would not do and the cycle can live without. Raises DriveError.
+    Args:
+        node: The drive.
+        needed: Indices of the objects that it has to carry.
+        wanted: Indices of objects to add if there is room for them.
+        notes: Extended by what the drive refuses and the cycle does not need.
+
+    Raises:
+        DriveError: If no TPDO can carry the needed objects.
     """
     choices = _choices(node, needed, wanted)
     layout = _mapped(node, od.TPDO_COMMUNICATION, choices, notes)
     _set_times(node, layout.communication, notes)
     node.change(layout.communication, 2, EVERY_SYNC)
     node.confirm(layout.communication, 2, EVERY_SYNC)
-    return _switched_on(node, layout)
+    return _switch_on(node, layout)
 
 
 def configure_rpdo(
     node: DriveNode, needed: Sequence[int], immediate: bool, notes: list[str]
 ) -> PdoLayout:
-    """Have an RPDO carry these objects, effective at the SYNC or on reception.
+    """Set up an RPDO with these objects, effective at the SYNC or on reception.
 
-    notes as for configure_tpdo. Raises DriveError.
+    Args:
+        node: The drive.
+        needed: Indices of the objects that it has to carry.
+        immediate: Effective on reception.
+        notes: Extended by what the drive refuses and the cycle does not need.
+
+    Raises:
+        DriveError: If no RPDO can carry the objects, or none in the way it is to be effective.
     """
     layout = _mapped(node, od.RPDO_COMMUNICATION, [list(needed)], notes)
     _set_times(node, layout.communication, notes)
     _set_effect(node, layout.communication, immediate)
-    return _switched_on(node, layout)
+    return _switch_on(node, layout)
 
 
 @contextmanager
 def while_off(node: DriveNode, communication: int) -> Iterator[None]:
-    """A PDO switched off meanwhile, where it is on: only then may its parameters change."""
+    """Switch a PDO off for as long as the context lasts: only then may its parameters change."""
     cob_id = node.read(communication, 1)
     if cob_id & _INVALID:
         yield
@@ -118,7 +134,7 @@ def while_off(node: DriveNode, communication: int) -> Iterator[None]:
 
 
 def _choices(node: DriveNode, needed: Sequence[int], wanted: Sequence[int]) -> list[list[int]]:
-    """What to map, the fullest first."""
+    """Return the possible mappings, the fullest first."""
     chosen = list(needed)
     choices = [chosen]
     for index in wanted:
@@ -132,9 +148,9 @@ def _choices(node: DriveNode, needed: Sequence[int], wanted: Sequence[int]) -> l
 
 
 def _mapped(node: DriveNode, first: int, choices: list[list[int]], notes: list[str]) -> PdoLayout:
-    """The first PDO with the fullest mapping that the drive takes; else a fixed one that will do.
+    """Map the first PDO with the fullest mapping that the drive accepts, else find a fixed one.
 
-    It is left switched off where its mapping was written.
+    A PDO whose mapping was written is left switched off.
     """
     refusals: list[DriveError] = []
     for objects in choices:
@@ -154,7 +170,7 @@ def _mapped(node: DriveNode, first: int, choices: list[list[int]], notes: list[s
         if layout.carries(needed):
             notes.append(f"0x{layout.communication:04X} is used as the drive has it: {refusals[0]}")
             return layout
-    # Of those that could be tried, the last one asked for the least.
+    # The last refusal is that of the smallest mapping.
     raise DriveError(f"{refusals[-1]}; {_missing(first, needed, present)}")
 
 
@@ -172,8 +188,8 @@ def _missing(first: int, needed: Sequence[int], present: Sequence[PdoLayout]) ->
 
 
 def _write_mapping(node: DriveNode, communication: int, objects: list[int]) -> PdoLayout:
-    # CiA 301, 7.5.2.36: switch the PDO off, empty the mapping, write it, set its length. All other
-    # bits of the COB-ID stay as the drive has them: some refuse to lose bit 30.
+    # CiA 301, 7.5.2.36: switch the PDO off, empty the mapping, write it, set its length. The other
+    # bits of the COB-ID stay as they are: some drives refuse to clear bit 30.
     mapping = communication + _MAPPING_OFFSET
     entries = [_entry(node, index) for index in objects]
     cob_id = node.read(communication, 1)
@@ -211,7 +227,7 @@ def _layout(communication: int, cob_id: int, entries: Sequence[int]) -> PdoLayou
 
 
 def _present(node: DriveNode, first: int) -> Iterator[PdoLayout]:
-    """The PDOs of one direction as the drive has them."""
+    """Read the PDOs of one direction as the drive has them."""
     for communication in range(first, first + _MAPPING_OFFSET):
         mapping = communication + _MAPPING_OFFSET
         if node.has(communication, 1) and node.has(mapping):
@@ -220,7 +236,7 @@ def _present(node: DriveNode, first: int) -> Iterator[PdoLayout]:
 
 
 def tpdos_on_sync(node: DriveNode) -> list[PdoLayout]:
-    """All TPDOs that the drive sends with SYNCs, every one or some. Raises DriveError."""
+    """Return all TPDOs that the drive sends with every SYNC or with some. Raises DriveError."""
     return [
         layout
         for layout in _present(node, od.TPDO_COMMUNICATION)
@@ -230,7 +246,7 @@ def tpdos_on_sync(node: DriveNode) -> list[PdoLayout]:
 
 
 def _set_times(node: DriveNode, communication: int, notes: list[str]) -> None:
-    """Neither inhibit time nor event timer: SYNC alone sets the pace."""
+    """Clear inhibit time and event timer, so that SYNC alone sets the pace."""
     for subindex, name in ((_INHIBIT_TIME, "inhibit time"), (_EVENT_TIMER, "event timer")):
         if not node.has(communication, subindex):
             continue
@@ -243,12 +259,12 @@ def _set_times(node: DriveNode, communication: int, notes: list[str]) -> None:
             unit = 0.1 if subindex == _INHIBIT_TIME else 1.0
             notes.append(
                 f"0x{communication:04X}:{subindex:02X}: the {name} stays at {found * unit:g} ms; a "
-                f"drive that heeds it with every SYNC too will leave TPDOs out ({error})"
+                f"drive that applies it to synchronous TPDOs will skip some of them ({error})"
             )
 
 
 def _set_effect(node: DriveNode, communication: int, immediate: bool) -> None:
-    """RPDO at the SYNC, or on reception, as `[drive] torque_pdo` wants it."""
+    """Make an RPDO effective at the SYNC or on reception, as `[drive] torque_pdo` says."""
     found = node.read(communication, 2)
     if immediate:
         types: tuple[int, ...] = ON_RECEPTION
@@ -266,16 +282,17 @@ def _set_effect(node: DriveNode, communication: int, immediate: bool) -> None:
             return
     if not suitable:
         other = "sync" if immediate else "immediate"
-        raise DriveError(f'{refusals[0]}; drive.torque_pdo = "{other}" may be what it has')
+        raise DriveError(f'{refusals[0]}; try drive.torque_pdo = "{other}"')
 
 
-def _switched_on(node: DriveNode, layout: PdoLayout) -> PdoLayout:
+def _switch_on(node: DriveNode, layout: PdoLayout) -> PdoLayout:
+    """Switch a PDO on and return its layout as the drive confirms it."""
     communication = layout.communication
     cob_id = node.read(communication, 1)
     if cob_id & _EXTENDED:
         raise DriveError(
             f"node {node.node_id}, 0x{communication:04X}:01 = {cob_id:#x}: a 29-bit identifier; "
-            f"give the PDO one of 11 bits"
+            f"give the PDO an 11-bit one"
         )
     if not cob_id & _CAN_ID:
         raise DriveError(
@@ -294,7 +311,10 @@ def _switched_on(node: DriveNode, layout: PdoLayout) -> PdoLayout:
 
 
 def with_constant(node: DriveNode, rpdo: PdoLayout, commanded: Sequence[int]) -> PdoLayout:
-    """An RPDO whose other fields (a mode, a limit) repeat what the drive has in these objects."""
+    """Return an RPDO whose other fields, e.g. a mode or a limit, repeat the drive's own values.
+
+    commanded: indices of the objects that the cycle writes. Raises DriveError.
+    """
     constant = 0
     for field in rpdo.fields:
         if field.index < _FIRST_OBJECT or (field.index in commanded and field.subindex == 0):

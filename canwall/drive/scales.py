@@ -1,4 +1,4 @@
-"""What one count and one per mille mean: from the drive's own objects, else the configuration."""
+"""Scales of a drive, one count and one per mille: from the configuration or the drive's objects."""
 
 import math
 from dataclasses import dataclass
@@ -11,10 +11,10 @@ from canwall.units import DriveUnits
 #: Units of 0x60A8 (bits 16 to 23) that are angles, in units per revolution (CiA 303-2).
 _ANGLES = {0x10: 2.0 * math.pi, 0x41: 360.0, 0xB4: 1.0}
 _ANGLE_NAMES = {0x10: "radian", 0x41: "degree", 0xB4: "revolution"}
-#: Increments, and no unit at all, which comes to the same.
+#: Increments, and no unit at all, which means the same.
 _INCREMENTS = (0xB5, 0x00)
 
-#: Bits of 0x607E: position, and (where a maker has it) torque.
+#: Bits of 0x607E: position, and torque with some manufacturers.
 _REVERSED = 1 << 7 | 1 << 5
 
 _GIVE_COUNTS = "give drive.counts_per_rev (increments per turn of the motor)"
@@ -22,10 +22,12 @@ _GIVE_COUNTS = "give drive.counts_per_rev (increments per turn of the motor)"
 
 @dataclass(frozen=True)
 class Scales:
-    """Units of a drive, the torque that it holds itself to, and where each comes from.
+    """Units and torque limit of a drive.
 
-    torque_limit_nm: what the drive gives at most, at the shaft [N·m].
-    sources: pairs (what, whence), for people.
+    Attributes:
+        units: Scales at the shaft.
+        torque_limit_nm: Largest torque that the drive gives, at the shaft [N·m].
+        sources: Pairs of a value as text and where it comes from.
     """
 
     units: DriveUnits
@@ -34,9 +36,9 @@ class Scales:
 
 
 def read_scales(node: DriveNode, settings: DriveSettings) -> Scales:
-    """Scales from 0x608F, 0x6091, 0x6092, 0x60A8 and 0x6076; what `[drive]` gives goes first.
+    """Read the scales from 0x608F, 0x6091, 0x6092, 0x60A8 and 0x6076, unless `[drive]` has them.
 
-    Raises DriveError that names the key which would settle it.
+    Raises DriveError that names the key to give for a scale that cannot be read.
     """
     _check_polarity(node)
     gear, gear_source = _gear_ratio(node, settings)
@@ -68,11 +70,11 @@ def _gear_ratio(node: DriveNode, settings: DriveSettings) -> tuple[float, str]:
         return settings.gear_ratio, "drive.gear_ratio"
     if node.has(od.GEAR_RATIO, 1):
         return _quotient(node, od.GEAR_RATIO), "0x6091"
-    return 1.0, "no 0x6091: taken for no gear"
+    return 1.0, "no 0x6091: assumed to have no gear"
 
 
 def _counts_per_rev(node: DriveNode, settings: DriveSettings, gear: float) -> tuple[float, str]:
-    """Units of 0x6064 per turn of the shaft (CiA 402-2, factor group)."""
+    """Return the units of 0x6064 per turn of the shaft (CiA 402-2, factor group), and a source."""
     if settings.counts_per_rev is not None:
         return settings.counts_per_rev * gear, "drive.counts_per_rev"
     if node.has(od.SI_UNIT_POSITION):
@@ -88,7 +90,7 @@ def _counts_per_rev(node: DriveNode, settings: DriveSettings, gear: float) -> tu
                 f"node {node.node_id}, 0x60A8 = {unit:#010x}: neither increments nor an angle; "
                 f"{_GIVE_COUNTS}"
             )
-    # A quotient of one is what a drive shows to which nobody has told its encoder or its feed.
+    # A quotient of one is the default of a drive whose encoder or feed was never set.
     if node.has(od.FEED_CONSTANT, 1):
         feed = _quotient(node, od.FEED_CONSTANT)
         if feed != 1.0:
@@ -97,7 +99,7 @@ def _counts_per_rev(node: DriveNode, settings: DriveSettings, gear: float) -> tu
         raise DriveError(f"the drive has no 0x608F: {_GIVE_COUNTS}")
     counts = _quotient(node, od.POSITION_ENCODER_RESOLUTION)
     if counts == 1.0:
-        raise DriveError(f"node {node.node_id}, 0x608F: 1/1 is no encoder; {_GIVE_COUNTS}")
+        raise DriveError(f"node {node.node_id}, 0x608F: 1/1 is not an encoder; {_GIVE_COUNTS}")
     return counts * gear, "0x608F" + (" and the gear" if gear != 1.0 else "")
 
 
@@ -110,7 +112,7 @@ def _rated_torque(node: DriveNode, settings: DriveSettings) -> tuple[float, str]
 
 
 def _torque_limit(node: DriveNode) -> tuple[float, str]:
-    """Per mille that 0x6072, 0x6073, 0x60E0 and 0x60E1 leave, and which of them is the lowest.
+    """Return the lowest of 0x6072, 0x6073, 0x60E0 and 0x60E1 in per mille, and which it is.
 
     0x6073 is in per mille of the rated current, which gives the rated torque.
     """
@@ -128,14 +130,14 @@ def _torque_limit(node: DriveNode) -> tuple[float, str]:
 
 
 def _check_polarity(node: DriveNode) -> None:
-    """Position and torque turned against one another make the wall pull where it has to push."""
+    """Raise DriveError if position and torque may have opposite signs: the wall would pull."""
     if not node.has(od.POLARITY):
         return
     polarity = node.read(od.POLARITY)
     if polarity & _REVERSED:
         raise DriveError(
-            f"node {node.node_id}, 0x607E = {polarity:#04x} may turn the position against the "
-            f"torque: clear it at the drive, or for the run by drive.parameters = "
+            f"node {node.node_id}, 0x607E = {polarity:#04x} may reverse the position relative to "
+            f"the torque: clear it at the drive, or for the run by drive.parameters = "
             f'{{ "0x607E" = 0 }}, and use wall.side'
         )
 
@@ -144,6 +146,6 @@ def _quotient(node: DriveNode, index: int) -> float:
     numerator, denominator = node.read(index, 1), node.read(index, 2)
     if numerator <= 0 or denominator <= 0:
         raise DriveError(
-            f"node {node.node_id}, 0x{index:04X}: {numerator}/{denominator} is no scale"
+            f"node {node.node_id}, 0x{index:04X}: {numerator}/{denominator} is not a scale"
         )
     return numerator / denominator

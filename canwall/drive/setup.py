@@ -1,4 +1,4 @@
-"""From a drive that is found somehow to one that is ready for the cycle: everything over SDO."""
+"""Set-up of a drive over SDO, from whatever state it is found in to one ready for the cycle."""
 
 import math
 import time
@@ -17,7 +17,7 @@ from canwall.drive.scales import Scales, read_scales
 from canwall.drive.watchdog import NO_WATCHDOG, Watchdog, arm
 from canwall.units import DriveUnits
 
-#: Without these objects a drive cannot render a wall, whatever its maker.
+#: Objects without which no drive can render a wall.
 REQUIRED_OBJECTS = (
     od.TPDO_COMMUNICATION,
     od.TPDO_MAPPING,
@@ -37,25 +37,30 @@ _COMMANDED = (od.CONTROLWORD, od.TARGET_TORQUE)
 
 _DISABLING_S = 2.0
 
-#: A watchdog shorter than this many cycles would bite a master that lives.
+#: Shortest watchdog in cycles; a shorter one would trip with a master that is alive.
 _WATCHDOG_CYCLES = 3
-#: In simulated time the master and its drive wait for each other, the drive's timers for nobody: a
-#: machine that has other things to do is no dead master.
+#: Watchdog in simulated time. Master and drive wait for each other, but the drive's timers run on:
+#: they must not expire on a busy machine.
 _SIMULATED_WATCHDOG_S = 30.0
 
 
 @dataclass(frozen=True)
 class DriveSetup:
-    """What the cycle needs to know of a drive that is set up.
+    """A drive that is set up, as the cycle uses it.
 
-    units: scales at the shaft. sync_cob_id: CAN-ID of the SYNC that the drive consumes.
-    tpdo, rpdo: where statusword, position, torque, controlword and target torque lie in them.
-    watchdog: what the cycle has to send beside the RPDOs, and how often.
-    sync_counter_overflow: 0x1019: from 1 to this counts the SYNC; 0: it carries nothing.
-    synchronous: whether the RPDO's torque waits for the next SYNC.
-    torque_limit_nm: what the drive itself holds the torque to, at the shaft [N·m].
-    scales, mode, identity: as they were found, for people.
-    notes: what the drive would not do and the cycle can live without.
+    Attributes:
+        units: Scales at the shaft.
+        sync_cob_id: CAN-ID of the SYNC that the drive consumes.
+        tpdo: TPDO with position and statusword, and torque and velocity if there is room.
+        rpdo: RPDO with controlword and target torque.
+        watchdog: Watchdog, and the frames that the cycle has to send for it.
+        synchronous: True if a torque acts at the next SYNC, False if on reception.
+        torque_limit_nm: Largest torque that the drive gives, at the shaft [N·m].
+        mode: Mode of operation and why it was chosen.
+        scales: Scales and where they come from.
+        identity: Identity of the drive.
+        notes: What the drive refused and the cycle does not need.
+        sync_counter_overflow: 0x1019: the SYNC counts from 1 to this; 0: it has no counter.
     """
 
     units: DriveUnits
@@ -75,10 +80,19 @@ class DriveSetup:
 def set_up(
     node: DriveNode, settings: DriveSettings, bus: BusSettings, real_time: bool
 ) -> DriveSetup:
-    """Torque mode, zero torque, PDOs on the SYNC, watchdog; ends in NMT OPERATIONAL.
+    """Set up torque mode, zero torque, PDOs on the SYNC and watchdog; end in NMT OPERATIONAL.
 
-    Nothing is enabled and nothing is stored in the drive; `node.restore` undoes it. Raises
-    DriveError, that names the key where the configuration has to supply what the drive cannot say.
+    Nothing is enabled, and nothing is stored in the drive; `node.restore` undoes the changes.
+
+    Args:
+        node: The drive.
+        settings: `[drive]`.
+        bus: `[bus]`.
+        real_time: Whether SYNCs keep to the clock.
+
+    Raises:
+        DriveError: If the drive cannot be set up; names the key for a value that it does not
+            provide.
     """
     node.wait_until_present(settings.wait_s)
     node.command("PRE-OPERATIONAL")
@@ -93,7 +107,7 @@ def set_up(
     node.write(od.TARGET_TORQUE, 0, 0)
     node.confirm(od.TARGET_TORQUE, 0, 0)
     _set_interpolation_period(node, bus.cycle_s, notes)
-    _settle_sync(node, bus.cycle_s, real_time, notes)
+    _configure_sync(node, bus.cycle_s, real_time, notes)
     immediate = settings.torque_pdo == "immediate"
     tpdo = configure_tpdo(node, _MEASURED, _MEASURED_TOO, notes)
     rpdo = configure_rpdo(node, _COMMANDED, immediate, notes)
@@ -125,9 +139,9 @@ def set_up(
 
 
 def disable(node: DriveNode) -> None:
-    """Take the torque away, and HALT and whatever else a predecessor has left in 0x6040.
+    """Disable the drive from any state, and clear all bits of 0x6040 that an earlier master set.
 
-    From any state; a fault stays, its reset belongs to enabling. Raises DriveError.
+    A fault stays; it is reset when the drive is enabled. Raises DriveError.
     """
     deadline = time.monotonic() + _DISABLING_S
     node.write(od.CONTROLWORD, 0, Controlword.DISABLE_VOLTAGE)
@@ -142,19 +156,19 @@ def disable(node: DriveNode) -> None:
 
 
 def _write_parameters(node: DriveNode, settings: DriveSettings) -> None:
-    """What the DCF and `[drive] parameters` want, in this order."""
+    """Write the values of the DCF, then `[drive] parameters`."""
     if settings.download_dcf:
         _download_dcf(node)
-    for (index, subindex), value in settings.written.items():
+    for (index, subindex), value in settings.parameters_by_index.items():
         node.set(index, subindex, value)
 
 
 def _download_dcf(node: DriveNode) -> None:
-    """Every ParameterValue of the DCF but those of the PDOs, which are set up for the wall.
+    """Write every ParameterValue of the DCF except those of the PDOs, which are set up here.
 
     Raises DriveError.
     """
-    for variable in node.configured():
+    for variable in node.dcf_objects():
         if variable.index >= od.RPDO_COMMUNICATION and variable.index < 0x1C00:
             continue
         if variable.index in _COMMANDED or "w" not in variable.access_type:
@@ -162,12 +176,12 @@ def _download_dcf(node: DriveNode) -> None:
         node.change(variable.index, variable.subindex, variable.value)
 
 
-def _settle_sync(node: DriveNode, cycle_s: float, real_time: bool, notes: list[str]) -> None:
-    """What the drive expects of the SYNC: its period where it watches it (0x1006), no window.
+def _configure_sync(node: DriveNode, cycle_s: float, real_time: bool, notes: list[str]) -> None:
+    """Set the period of the SYNC if the drive monitors it (0x1006), and no window (0x1007).
 
-    An RPDO after the synchronous window (0x1007) is dropped without a word; without one, a late
-    torque acts a cycle later, is counted, and in the end trips (limits.late_cycles). In simulated
-    time SYNC has no period by the clock.
+    An RPDO after the synchronous window is dropped silently. Without a window a late torque acts a
+    cycle later, is counted, and eventually trips (limits.late_cycles). In simulated time the SYNC
+    has no period by the clock.
     """
     wanted = {od.SYNCHRONOUS_WINDOW: 0}
     if node.has(od.COMMUNICATION_CYCLE_PERIOD) and node.read(od.COMMUNICATION_CYCLE_PERIOD):
@@ -181,7 +195,7 @@ def _settle_sync(node: DriveNode, cycle_s: float, real_time: bool, notes: list[s
 
 
 def _set_interpolation_period(node: DriveNode, cycle_s: float, notes: list[str]) -> None:
-    """0x60C2: how often a new torque comes, for drives that watch over it or interpolate."""
+    """Set the interval of new torques (0x60C2), for drives that monitor it or interpolate."""
     if not node.has(od.INTERPOLATION_TIME_PERIOD, 2):
         return
     for exponent in (-3, -4, -5, -6):

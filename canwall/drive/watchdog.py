@@ -1,8 +1,8 @@
-"""The drive's own watchdog against a dead master: which one it has, set and read back.
+"""Watchdog of the drive against a dead master.
 
-In the order of their strength: the deadline of the RPDO itself (0x1400:05) notices a cycle that
-hangs; the consumer heartbeat (0x1016) and life guarding (0x100C, 0x100D) a master that is gone.
-What the drive does then is set by 0x6007, or follows from 0x1029.
+In the order of their strength: the deadline of the RPDO itself (0x1400:05) detects a cycle that
+hangs; the consumer heartbeat (0x1016) and life guarding (0x100C, 0x100D) detect a master that is
+gone. The reaction of the drive is set by 0x6007, or follows from 0x1029.
 """
 
 import math
@@ -18,16 +18,16 @@ _OPERATIONAL = 5
 _EVENT_TIMER = 5
 _MAX_MS = 0xFFFF
 
-#: Signs of life within one watchdog time: two may be lost or late.
-_BEATS = 3
+#: Frames within one watchdog time, so that two may be lost or late.
+_FRAMES_PER_TIMEOUT = 3
 
-#: 0x6007, the best for a wall first: no torque at once, then what a fault does, then quick stop.
+#: Values of 0x6007, the best for a wall first: no torque at once, reaction to a fault, quick stop.
 _REACTIONS = {2: "disable voltage", 1: "fault", 3: "quick stop"}
 
 
 @dataclass(frozen=True)
 class ErrorControlFrame:
-    """A frame by which the master shows that it lives."""
+    """A frame that shows the drive a living master: a heartbeat or a guarding request."""
 
     can_id: int
     data: bytes = b""
@@ -36,14 +36,16 @@ class ErrorControlFrame:
 
 @dataclass(frozen=True)
 class Watchdog:
-    """What watches the master, and what the master has to send for it.
+    """Watchdog of a drive, and the frames that the master has to send for it.
 
-    kind: "RPDO event timer", "consumer heartbeat", "life guarding" or "none".
-    time_s: silence after which the drive reacts [s].
-    beat: the frame that the cycle has to send at least every `period_s` seconds, the first one
-    with the first cycle; None: its RPDOs are what is watched, or nothing is.
-    reaction: what the drive does then, as it confirmed it.
-    passed_over: why the stronger ones are not used.
+    Attributes:
+        kind: "RPDO event timer", "consumer heartbeat", "life guarding" or "none".
+        time_s: Silence of the master after which the drive reacts [s].
+        error_control: Frame to send, from the first cycle on; None if the RPDOs are monitored, or
+            nothing is.
+        period_s: Longest interval between two of these frames [s].
+        reaction: Reaction of the drive, as it confirmed it.
+        passed_over: Why stronger watchdogs are not used.
     """
 
     kind: str
@@ -66,37 +68,45 @@ NO_WATCHDOG = Watchdog("none")
 def arm(
     node: DriveNode, rpdo: PdoLayout, time_s: float, master_id: int, accept_none: bool
 ) -> Watchdog:
-    """Set the strongest watchdog that the drive takes; it begins with the first sign of life.
+    """Set the strongest watchdog that the drive accepts; it starts with the first frame.
 
-    Raises DriveError where it takes none, unless that is accepted.
+    Args:
+        node: The drive.
+        rpdo: RPDO of the cycle.
+        time_s: Silence of the master after which the drive is to react [s].
+        master_id: Node-ID of the master.
+        accept_none: Accept a drive without a watchdog.
+
+    Raises:
+        DriveError: If the drive accepts none.
     """
     passed_over: list[str] = []
     time_ms = min(math.ceil(round(time_s * 1e3, 6)), _MAX_MS)
-    ways: tuple[tuple[str, Callable[[], tuple[float, ErrorControlFrame | None, float]]], ...] = (
+    kinds: tuple[tuple[str, Callable[[], tuple[float, ErrorControlFrame | None, float]]], ...] = (
         ("RPDO event timer", lambda: _rpdo_event_timer(node, rpdo, time_ms)),
         ("consumer heartbeat", lambda: _consumer_heartbeat(node, time_ms, master_id)),
         ("life guarding", lambda: _life_guarding(node, time_ms)),
     )
-    for kind, way in ways:
+    for kind, set_watchdog in kinds:
         try:
-            held_s, beat, period_s = way()
+            held_s, frame, period_s = set_watchdog()
         except DriveError as error:
             passed_over.append(f"{kind}: {error}")
         else:
-            return Watchdog(kind, held_s, beat, period_s, _reaction(node), tuple(passed_over))
+            return Watchdog(kind, held_s, frame, period_s, _set_reaction(node), tuple(passed_over))
     if accept_none:
         return Watchdog("none", passed_over=tuple(passed_over))
     raise DriveError(
         f"node {node.node_id}: no watchdog, so a master that dies leaves the torque on "
-        f"({'; '.join(passed_over)}); --accept-no-watchdog goes on without one"
+        f"({'; '.join(passed_over)}); --accept-no-watchdog accepts that"
     )
 
 
 def disarm(node: DriveNode, rpdo: PdoLayout, watchdog: Watchdog) -> None:
-    """Switch off what `arm` has set, for a drive that is disabled: it would miss its master.
+    """Switch off the watchdog of a drive that is disabled, which would report its master as lost.
 
-    In PRE-OPERATIONAL first, which ends the PDOs, and so the deadline of the RPDO, at once. What
-    `restore` has to undo stays known. Raises DriveError, can.CanError.
+    PRE-OPERATIONAL comes first: it ends the PDOs, and with them the deadline of the RPDO, at once.
+    `restore` still knows the values from before `arm`. Raises DriveError, can.CanError.
     """
     node.command("PRE-OPERATIONAL")
     if watchdog.kind == "RPDO event timer":
@@ -136,12 +146,12 @@ def _consumer_heartbeat(
     free = [i for i, value in present.items() if not value & 0xFFFF or value >> 16 == master_id]
     if not free:
         raise DriveError("0x1016: every entry watches another node")
-    # An entry that is in use is changed only after it was switched off.
+    # An entry in use has to be switched off before it is changed.
     if present[free[0]]:
         node.set(od.CONSUMER_HEARTBEAT_TIME, free[0], 0)
     node.set(od.CONSUMER_HEARTBEAT_TIME, free[0], master_id << 16 | time_ms)
-    beat = ErrorControlFrame(ERROR_CONTROL + master_id, bytes([_OPERATIONAL]))
-    return time_ms * 1e-3, beat, time_ms * 1e-3 / _BEATS
+    frame = ErrorControlFrame(ERROR_CONTROL + master_id, bytes([_OPERATIONAL]))
+    return time_ms * 1e-3, frame, time_ms * 1e-3 / _FRAMES_PER_TIMEOUT
 
 
 def _life_guarding(node: DriveNode, time_ms: int) -> tuple[float, ErrorControlFrame | None, float]:
@@ -150,14 +160,15 @@ def _life_guarding(node: DriveNode, time_ms: int) -> tuple[float, ErrorControlFr
     # A node that sends heartbeats is not guarded (CiA 301, 7.2.8.3.2).
     if node.has(od.PRODUCER_HEARTBEAT_TIME) and node.read(od.PRODUCER_HEARTBEAT_TIME):
         node.set(od.PRODUCER_HEARTBEAT_TIME, 0, 0)
-    guard_ms = math.ceil(time_ms / _BEATS)
+    guard_ms = math.ceil(time_ms / _FRAMES_PER_TIMEOUT)
     node.set(od.GUARD_TIME, 0, guard_ms)
-    node.set(od.LIFE_TIME_FACTOR, 0, _BEATS)
-    beat = ErrorControlFrame(ERROR_CONTROL + node.node_id, remote=True)
-    return guard_ms * _BEATS * 1e-3, beat, guard_ms * 1e-3
+    node.set(od.LIFE_TIME_FACTOR, 0, _FRAMES_PER_TIMEOUT)
+    frame = ErrorControlFrame(ERROR_CONTROL + node.node_id, remote=True)
+    return guard_ms * _FRAMES_PER_TIMEOUT * 1e-3, frame, guard_ms * 1e-3
 
 
-def _reaction(node: DriveNode) -> str:
+def _set_reaction(node: DriveNode) -> str:
+    """Set the reaction of the watchdog and return it as text."""
     if node.has(od.ABORT_CONNECTION_OPTION_CODE):
         for code, name in _REACTIONS.items():
             try:
@@ -169,8 +180,8 @@ def _reaction(node: DriveNode) -> str:
         if kept in _REACTIONS:
             return f"{_REACTIONS[kept]} (0x6007 = {kept}, as the drive has it)"
     if node.has(od.ERROR_BEHAVIOUR, 1):
-        # 1 would leave the NMT state, and with it the RPDOs' last torque, as it is.
+        # 1 would keep the NMT state, and with it the last torque of the RPDO.
         if node.read(od.ERROR_BEHAVIOUR, 1) == 1:
             node.set(od.ERROR_BEHAVIOUR, 1, 0)
-        return "leaves NMT OPERATIONAL (0x1029:01); what its torque does then, a test shows"
-    return "what the drive is made to do: it has neither 0x6007 nor 0x1029"
+        return "leaves NMT OPERATIONAL (0x1029:01); test what its torque does then"
+    return "unknown: the drive has neither 0x6007 nor 0x1029"

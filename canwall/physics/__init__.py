@@ -1,7 +1,7 @@
-"""Exact motion of what the wall acts on: oscillator flow, ZOH equivalents, friction, contact.
+"""Exact motion of handle and hand: oscillator flow, ZOH equivalents, friction, contact.
 
-Everything is compiled and free of allocation on the hot path. Nothing here knows of walls as
-control laws, of drives or of CAN.
+Everything is compiled and does not allocate on the hot path. Nothing here depends on control laws,
+drives or CAN.
 """
 
 from canwall.physics.contact import Grasp, HandBody, advance_grasp

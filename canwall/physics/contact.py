@@ -1,8 +1,8 @@
-"""A hand on the handle that can let go: two bodies and a contact that presses but never pulls.
+"""Contact of hand and handle as two bodies: it can press but not pull.
 
-While the hand presses, the two move as one. They part at the instant at which the contact would
-have to pull, and meet again at the instant at which the gap between them closes; what is left of
-their relative velocity is lost there (a plastic impact: momentum stays, energy goes).
+While the hand presses, the two move as one. They part when the contact would have to pull, and
+meet again when the gap between them closes. The impact is plastic: momentum is conserved, the
+energy of the relative motion is lost.
 """
 
 import math
@@ -11,27 +11,31 @@ from typing import NamedTuple
 from canwall.compiled import Record, compiled
 from canwall.physics.motion import (
     MAX_EVENTS,
-    onset,
-    passed,
-    piece_at,
+    linear_piece,
+    motion_from,
+    move_to_event,
     quarter_period,
-    slide,
+    time_after,
 )
 from canwall.physics.smooth import (
     EventFunction,
     Force,
     Smooth,
-    departure,
+    deviation,
     event_value,
-    first_turn,
+    first_sign_change,
     largest_acceleration,
-    later,
-    state,
+    shifted,
+    state_at,
 )
 
 
 class HandBody(NamedTuple):
-    """The hand as a body, about where its force law puts it; side −1.0 presses down, 1.0 up."""
+    """The hand as a body of its own.
+
+    The rest position of its spring is part of the force of its script. side is the direction in
+    which it presses: −1.0 down, 1.0 up.
+    """
 
     mass: float
     viscous: float
@@ -40,10 +44,7 @@ class HandBody(NamedTuple):
 
 
 class Grasp(NamedTuple):
-    """Handle and hand: position and velocity of each, and whether they touch.
-
-    Where they touch, both move alike.
-    """
+    """Position and velocity of handle and hand, which are equal while they touch."""
 
     y: float
     v: float
@@ -52,19 +53,18 @@ class Grasp(NamedTuple):
     touching: bool
 
 
-#: Steps towards the closing of a gap after which it is closed to the last bit.
+#: Bound of the steps towards the closing of a gap; far more than rounding allows.
 _MAX_STEPS = 10_000
-#: Share of its span below which a flight is not looked at: right after parting, the gap is zero
-#: and opens.
+#: Shortest step of a flight, as a share of its span: right after parting the gap is zero and opens.
 _SHORTEST_FLIGHT = 2.0**-20
 
 
 @compiled
 def _time_to_close(handle: Smooth, hand: Smooth, side: float, span: float) -> float:
-    """First time in (0, span] at which the gap between them is closed and closing, else inf.
+    """Return the first time in (0, span] at which the gap closes, else inf.
 
-    The gap is stepped along no further than the largest relative acceleration could close it:
-    each step ends before the gap does, and the last ones are Newton's.
+    A step is no longer than the largest relative acceleration would need to close the gap, so no
+    closing is stepped over; near it the steps are those of Newton's method.
     """
     gap0 = side * (handle.y - hand.y)
     speed0 = side * (handle.v - hand.v)
@@ -81,8 +81,8 @@ def _time_to_close(handle: Smooth, hand: Smooth, side: float, span: float) -> fl
         t += step
         if t > span:
             return math.inf
-        moved, accelerated = departure(handle, t)
-        hand_moved, hand_accelerated = departure(hand, t)
+        moved, accelerated = deviation(handle, t)
+        hand_moved, hand_accelerated = deviation(hand, t)
         gap = gap0 + speed0 * t + side * (moved - hand_moved)
         speed = speed0 + side * (accelerated - hand_accelerated)
     return t
@@ -90,14 +90,14 @@ def _time_to_close(handle: Smooth, hand: Smooth, side: float, span: float) -> fl
 
 @compiled
 def contact_force(hand: HandBody, script: Force, y: float, v: float, a: float) -> float:
-    """What the hand presses with while it moves with the handle; negative where it would pull."""
+    """Return the force with which a hand that moves with the handle presses; negative: it pulls."""
     push = script.constant - hand.viscous * v - hand.spring * y - hand.mass * a
     return hand.side * push
 
 
 @compiled
-def _pressing(hand: HandBody, script: Force) -> EventFunction:
-    """`contact_force` as a function of time, to be event_value along the motion of both."""
+def _contact_force_event(hand: HandBody, script: Force) -> EventFunction:
+    """Return `contact_force` as an event function of the joint motion."""
     side = hand.side
     return EventFunction(
         side * script.constant,
@@ -109,18 +109,18 @@ def _pressing(hand: HandBody, script: Force) -> EventFunction:
 
 
 @compiled
-def _together(
+def _move_together(
     joined: Record, hand: HandBody, now: Grasp, motor: Force, script: Force, remaining: float
 ) -> tuple[float, Grasp]:
-    """Motion of both as one up to the next event: (duration, grasp then)."""
+    """Move both as one to the next event: (duration, grasp at its end)."""
     total = Force(
         motor.constant + script.constant, motor.slope + script.slope, motor.excess, motor.rate
     )
     y, v = now.y, now.v
-    piece, _ = piece_at(joined, y, v, total.constant)
-    stuck, motion, direction = onset(joined, piece, y, v, total, remaining)
+    piece, _ = linear_piece(joined, y, v, total.constant)
+    stuck, motion, direction = motion_from(joined, piece, y, v, total, remaining)
     if stuck > 0.0:
-        # At rest the hand's own force alone decides whether it stays.
+        # At rest the contact force is the hand's own force.
         press = contact_force(hand, script, y, 0.0, 0.0)
         fading = -hand.side * script.slope
         if press < 0.0:
@@ -129,34 +129,34 @@ def _together(
             return press / fading, Grasp(y, v, y, v, False)
         if stuck >= remaining:
             return remaining, Grasp(y, v, y, v, True)
-    event = _pressing(hand, later(script, stuck))
+    event = _contact_force_event(hand, shifted(script, stuck))
     if event_value(motion, event, 0, 0.0)[0] < 0.0:
         return stuck, Grasp(y, v, y, v, False)
-    dt, y, v = slide(piece, motion, direction, remaining - stuck)
-    parting = first_turn(motion, event, 1.0, dt)
+    dt, y, v = move_to_event(piece, motion, direction, remaining - stuck)
+    parting = first_sign_change(motion, event, 1.0, dt)
     if parting < dt:
-        y, v = state(motion, parting)
+        y, v = state_at(motion, parting)
         return stuck + parting, Grasp(y, v, y, v, False)
     return stuck + dt, Grasp(y, v, y, v, True)
 
 
 @compiled
 def _impact(handle: Smooth, hand: Smooth, t: float) -> Grasp:
-    """Both as one after the gap between them has closed at time t."""
-    y, v = state(handle, t)
-    _, hand_v = state(hand, t)
+    """Return both as one after the impact at time t."""
+    y, v = state_at(handle, t)
+    _, hand_v = state_at(hand, t)
     v += (hand_v - v) * hand.mass / (handle.mass + hand.mass)
     return Grasp(y, v, y, v, True)
 
 
 @compiled
-def _apart(
+def _move_apart(
     handle: Record, hand: HandBody, now: Grasp, motor: Force, script: Force, remaining: float
 ) -> tuple[float, Grasp]:
-    """Motion of each alone up to the next event: (duration, grasp then)."""
+    """Move each alone to the next event: (duration, grasp at its end)."""
     y, v = now.y, now.v
-    piece, _ = piece_at(handle, y, v, motor.constant)
-    stuck, motion, direction = onset(handle, piece, y, v, motor, remaining)
+    piece, _ = linear_piece(handle, y, v, motor.constant)
+    stuck, motion, direction = motion_from(handle, piece, y, v, motor, remaining)
     span = min(remaining, quarter_period(hand.mass, hand.spring))
     flight = Smooth(
         hand.mass,
@@ -175,10 +175,10 @@ def _apart(
         closing = _time_to_close(still, flight, hand.side, wait)
         if closing <= wait:
             return closing, _impact(still, flight, closing)
-        hand_y, hand_v = state(flight, wait)
+        hand_y, hand_v = state_at(flight, wait)
         if stuck >= span:
             return wait, Grasp(y, 0.0, hand_y, hand_v, False)
-        script = later(script, stuck)
+        script = shifted(script, stuck)
         flight = Smooth(
             hand.mass,
             hand.viscous,
@@ -190,11 +190,11 @@ def _apart(
             0.0,
             0.0,
         )
-    dt, y, v = slide(piece, motion, direction, span - stuck)
+    dt, y, v = move_to_event(piece, motion, direction, span - stuck)
     closing = _time_to_close(motion, flight, hand.side, dt)
     if closing <= dt:
         return stuck + closing, _impact(motion, flight, closing)
-    hand_y, hand_v = state(flight, dt)
+    hand_y, hand_v = state_at(flight, dt)
     return stuck + dt, Grasp(y, v, hand_y, hand_v, False)
 
 
@@ -208,11 +208,16 @@ def advance_grasp(
     script: Force,
     duration: float,
 ) -> Grasp:
-    """Handle and hand after `duration`.
+    """Return handle and hand after `duration`.
 
-    handle and joined are records of dtype PLANT: the handle alone, and both as one (their masses,
-    dampings and springs added). motor is what acts on the handle, script what acts on the hand
-    but for its own damper and spring (a ramp: it has no excess).
+    Args:
+        handle: Plant of the handle alone, a record of dtype PLANT.
+        joined: Plant of both as one, with masses, dampings and springs added.
+        hand: The hand alone.
+        now: State at the start.
+        motor: Force on the handle.
+        script: Force on the hand, besides its damper and spring; a ramp without excess.
+        duration: Time [s].
     """
     t = 0.0
     for _ in range(MAX_EVENTS):
@@ -220,8 +225,12 @@ def advance_grasp(
             return now
         remaining = duration - t
         if now.touching:
-            dt, now = _together(joined, hand, now, later(motor, t), later(script, t), remaining)
+            dt, now = _move_together(
+                joined, hand, now, shifted(motor, t), shifted(script, t), remaining
+            )
         else:
-            dt, now = _apart(handle, hand, now, later(motor, t), later(script, t), remaining)
-        t = passed(t, dt, duration)
+            dt, now = _move_apart(
+                handle, hand, now, shifted(motor, t), shifted(script, t), remaining
+            )
+        t = time_after(t, dt, duration)
     return Grasp(math.nan, math.nan, math.nan, math.nan, False)

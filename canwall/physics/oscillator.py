@@ -1,10 +1,10 @@
-"""The linear oscillator m·ÿ + b·ẏ + k·y = u₀ + u₁·t, solved exactly for every m > 0, b, k ≥ 0.
+"""Exact solution of the linear oscillator m·ÿ + b·ẏ + k·y = u₀ + u₁·t for m > 0 and b, k ≥ 0.
 
-One set of four functions of time carries every solution: the impulse response h with
+Four functions of time give every solution: the impulse response h with
 h'' + (b/m)·h' + (k/m)·h = 0, h(0) = 0, h'(0) = 1, its derivative, and its first two integrals.
-They are entire functions of b/m, k/m and t, so one power series serves the free mass, the
-undamped, damped, critically damped and overdamped oscillator alike; longer times are reached by
-doubling. No case distinction means no cancellation where two cases meet (b → 0, k → 0).
+They are entire functions of b/m, k/m and t, so a single power series serves the free mass and the
+undamped, damped, critically damped and overdamped oscillator; doubling extends it to longer times.
+Without case distinctions there is no cancellation where two cases meet (b → 0, k → 0).
 """
 
 import math
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from canwall.compiled import compiled
 
 # Terms of the power series. With |b/m·t| + √(k/m)·|t| ≤ 1/2 the last one is below 2^-13/13! ≈ 2e-14
-# of the first before its own factor s_n ≤ 2^-12 enters: beneath the rounding of a double.
+# of the first, and its factor s_n ≤ 2^-12 takes it below the rounding of a double.
 _TERMS = 14
 _REACH = 0.5
 _INVERSE_FACTORIALS = tuple(1.0 / math.factorial(n) for n in range(_TERMS + 3))
@@ -26,13 +26,17 @@ _MAX_DOUBLINGS = 60
 def basis(
     damping_ratio: float, stiffness_ratio: float, t: float
 ) -> tuple[float, float, float, float]:
-    """Impulse response of the oscillator at time t: (h', h, ∫h, ∬h).
+    """Return the impulse response of the oscillator and its integrals at time t: (h', h, ∫h, ∬h).
 
-    damping_ratio is b/m [1/s], stiffness_ratio k/m [1/s²], t [s] of either sign. From them, for
-    any initial state and input u₀ + u₁·t (per unit mass):
+    For any initial state and input u₀ + u₁·t per unit mass
     y = y₀·(1 − k/m·∫h) + v₀·h + u₀·∫h + u₁·∬h, and v is its derivative.
+
+    Args:
+        damping_ratio: b/m [1/s].
+        stiffness_ratio: k/m [1/s²].
+        t: Time of either sign [s].
     """
-    # Halve the time until the series converges at full speed, ...
+    # Halve the time until the series converges quickly, ...
     doublings = 0
     while (
         abs(damping_ratio * t) + math.sqrt(abs(stiffness_ratio)) * abs(t) > _REACH
@@ -55,7 +59,7 @@ def basis(
     h0 *= t
     g1 *= t * t
     g2 *= t * t * t
-    # ... then let the motion continue from its own end, twice as far each time.
+    # ... then continue the motion from its own end, doubling the time.
     for _ in range(doublings):
         c = 1.0 - stiffness_ratio * g1
         g2 = c * g2 + h0 * g1 + t * g1 + g2
@@ -69,11 +73,16 @@ def basis(
 def lag_response(
     damping_ratio: float, stiffness_ratio: float, rate: float, t: float
 ) -> tuple[float, float, float, float, float, float]:
-    """(h', h, ∫h, ∬h, r', r): `basis`, and the response r to what a first-order lag leaves.
+    """Return (h', h, ∫h, ∬h, r', r): `basis`, and the response r to the decay of a first-order lag.
 
-    r'' + b/m·r' + k/m·r = exp(−rate·t) − 1 from rest; rate [1/s] is that of the lag. The same
-    series and the same doubling, so a lag as fast as the oscillator (resonance) is no case of its
-    own either.
+    r'' + b/m·r' + k/m·r = exp(−rate·t) − 1 from rest. The series and the doubling are those of
+    `basis`, so a lag in resonance with the oscillator is not a special case either.
+
+    Args:
+        damping_ratio: b/m [1/s].
+        stiffness_ratio: k/m [1/s²].
+        rate: Rate of the lag [1/s].
+        t: Time [s].
     """
     doublings = 0
     while (
@@ -86,7 +95,7 @@ def lag_response(
     q = stiffness_ratio * t * t
     h1 = h0 = g1 = g2 = r1 = r0 = 0.0
     term, following = 1.0, -p
-    # The lag's share of the series begins with its third term: c_3 = −rate·t.
+    # The series of the lag begins with its third term, c_3 = −rate·t.
     power = -rate * t
     lagged, lagging = power, power * power - p * power
     for n in range(_TERMS):
@@ -107,8 +116,8 @@ def lag_response(
     gone = math.expm1(-rate * t)
     for _ in range(doublings):
         c = 1.0 - stiffness_ratio * g1
-        # After t the lag's share goes on as it began, smaller by what is gone, and what is gone
-        # acts as a constant.
+        # After t the response to the lag continues as it began, scaled by what has not decayed;
+        # what has decayed acts as a constant.
         r1, r0 = (
             (h1 + 1.0 + gone) * r1 - stiffness_ratio * h0 * r0 + gone * h0,
             (c + 1.0 + gone) * r0 + h0 * r1 + gone * g1,
@@ -132,13 +141,13 @@ def flow(
     u1: float,
     t: float,
 ) -> tuple[float, float]:
-    """State (y, ẏ) after time t of m·ÿ + b·ẏ + k·y = u₀ + u₁·t from (y, v).
+    """Return the state (y, ẏ) at time t of m·ÿ + b·ẏ + k·y = u₀ + u₁·t, starting from (y, v).
 
-    Units: any consistent set, e.g. kg·m², N·m·s/rad, N·m/rad, rad, rad/s, N·m, N·m/s, s.
+    Units are any consistent set, e.g. kg·m², N·m·s/rad, N·m/rad, rad, rad/s, N·m, N·m/s, s.
     """
     kappa = spring / mass
     h1, h0, g1, g2 = basis(viscous / mass, kappa, t)
-    # From equilibrium nothing moves, to the last bit: what pulls is summed up before it acts.
+    # Forces are summed first, so that nothing moves from equilibrium, not even by rounding.
     a0 = (u0 - spring * y) / mass
     a1 = u1 / mass
     return y + v * h0 + a0 * g1 + a1 * g2, v * h1 + a0 * h0 + a1 * g1
@@ -146,7 +155,7 @@ def flow(
 
 @compiled
 def acceleration(mass: float, viscous: float, spring: float, y: float, v: float, u: float) -> float:
-    """ÿ of m·ÿ + b·ẏ + k·y = u."""
+    """Return ÿ of m·ÿ + b·ẏ + k·y = u."""
     return (u - viscous * v - spring * y) / mass
 
 
@@ -154,7 +163,7 @@ def acceleration(mass: float, viscous: float, spring: float, y: float, v: float,
 def zoh_coefficients(
     mass: float, viscous: float, spring: float, period: float
 ) -> tuple[float, float, float, float, float, float]:
-    """Zero-order-hold equivalent over one period: (Φ₁₁, Φ₁₂, Φ₂₁, Φ₂₂, Γ₁, Γ₂).
+    """Return the zero-order-hold equivalent over one period: (Φ₁₁, Φ₁₂, Φ₂₁, Φ₂₂, Γ₁, Γ₂).
 
     x[j+1] = Φ·x[j] + Γ·u[j] with x = [y, ẏ] and u held (theory, section 1; 5.17–5.19).
     """
@@ -166,6 +175,6 @@ def zoh_coefficients(
 def zoh(
     mass: float, viscous: float, spring: float, period: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Zero-order-hold equivalent as matrices: Φ of shape (2, 2) and Γ of shape (2,)."""
+    """Return the zero-order-hold equivalent as Φ, shape (2, 2), and Γ, shape (2,)."""
     p11, p12, p21, p22, c1, c2 = zoh_coefficients(mass, viscous, spring, period)
     return np.array([[p11, p12], [p21, p22]]), np.array([c1, c2])

@@ -1,11 +1,10 @@
-"""Motion between two events: a linear oscillator under a ramp and what a first-order lag leaves.
+"""Motion between two events (an oscillator under a ramp and a decaying lag), and their search.
 
-And the search for the next event. Newton's iteration finds a root in a bracket; that no root is
-missed, and none found twice, is a matter of brackets on which the function is monotone. They are
-the zeros of its derivative, which has brackets of its own, down to a function whose zeros can be
-counted: once the derivatives have removed the ramp and (D + rate) the lag, what is left of any
-function of position, velocity and acceleration is a damped oscillation, with one zero at the most
-within a quarter of its period.
+Newton's method finds a root in a bracket. No root is missed or found twice because the function is
+monotone on each bracket. The ends of the brackets are the zeros of its derivative, which are found
+in the same way, down to a function whose zeros can be counted: after two derivatives have removed
+the ramp, and (D + rate) the lag, any function of position, velocity and acceleration is a damped
+oscillation, which has at most one zero in a quarter of its period.
 """
 
 import math
@@ -20,9 +19,9 @@ _MAX_ITERATIONS = 200
 
 
 class Force(NamedTuple):
-    """constant + slope·t − excess·(1 − exp(−rate·t)): the excess dies away at `rate` [1/s].
+    """Force constant + slope·t − excess·(1 − exp(−rate·t)), whose excess decays at `rate` [1/s].
 
-    A current loop of first order delivers such a torque: it starts at `constant` and ends at the
+    This is the torque of a first-order current loop: it starts at `constant` and tends to the
     demand, constant − excess.
     """
 
@@ -33,9 +32,9 @@ class Force(NamedTuple):
 
 
 class Smooth(NamedTuple):
-    """mass·ÿ + viscous·ẏ + spring·y = F(t) from (y, v), with F as in `Force`; spring of any sign.
+    """Motion mass·ÿ + viscous·ẏ + spring·y = F(t) from (y, v), F as in `Force`, spring of any sign.
 
-    What is constant between two events, friction above all, is in `constant`.
+    Forces that are constant between two events, such as friction, are part of `constant`.
     """
 
     mass: float
@@ -50,7 +49,7 @@ class Smooth(NamedTuple):
 
 
 class EventFunction(NamedTuple):
-    """constant + slope·t + position·y + velocity·ẏ + acceleration·ÿ: events are its zeros."""
+    """Function constant + slope·t + position·y + velocity·ẏ + acceleration·ÿ, zero at events."""
 
     constant: float
     slope: float
@@ -64,8 +63,8 @@ ACCELERATION = EventFunction(0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 @compiled
-def later(force: Force, t: float) -> Force:
-    """The same force, seen from t on."""
+def shifted(force: Force, t: float) -> Force:
+    """Return the same force with its time starting at t."""
     constant = force.constant + force.slope * t
     if force.excess == 0.0:
         return Force(constant, force.slope, 0.0, force.rate)
@@ -88,8 +87,8 @@ def _lagged_state(motion: Smooth, t: float) -> tuple[float, float]:
 
 
 @compiled
-def state(motion: Smooth, t: float) -> tuple[float, float]:
-    """(y, ẏ) at time t."""
+def state_at(motion: Smooth, t: float) -> tuple[float, float]:
+    """Return (y, ẏ) at time t."""
     m = motion
     if m.excess == 0.0:
         return flow(m.mass, m.viscous, m.spring, m.y, m.v, m.constant, m.slope, t)
@@ -97,8 +96,8 @@ def state(motion: Smooth, t: float) -> tuple[float, float]:
 
 
 @compiled
-def departure(motion: Smooth, t: float) -> tuple[float, float]:
-    """(y − y(0) − ẏ(0)·t, ẏ − ẏ(0)) at time t, precise to the last bit however small t is."""
+def deviation(motion: Smooth, t: float) -> tuple[float, float]:
+    """Return (y − y(0) − ẏ(0)·t, ẏ − ẏ(0)) at time t, without cancellation for small t."""
     m = motion
     _, h0, g1, g2, r1, r0 = lag_response(m.viscous / m.mass, m.spring / m.mass, m.rate, t)
     a0 = (m.constant - m.viscous * m.v - m.spring * m.y) / m.mass
@@ -109,11 +108,11 @@ def departure(motion: Smooth, t: float) -> tuple[float, float]:
 
 @compiled
 def largest_acceleration(motion: Smooth, span: float) -> float:
-    """A bound of |ÿ| over [0, span].
+    """Return a bound of |ÿ| over [0, span].
 
-    ÿ = ÿ(0)·h' + (slope − spring·ẏ(0))/m·h + the lag's share, with |h'| ≤ 1 for an oscillator,
-    ≤ cosh for a negative spring, |h| no more than its integral, and the lag's share no more than
-    what of it has gone.
+    ÿ = ÿ(0)·h' + (slope − spring·ẏ(0))/m·h + the lag's part, with |h'| ≤ 1 for an oscillator and
+    ≤ cosh for a negative spring, |h| at most its integral, and the lag's part at most what has
+    decayed of it.
     """
     m = motion
     growth = math.cosh(math.sqrt(max(-m.spring / m.mass, 0.0)) * span)
@@ -125,13 +124,13 @@ def largest_acceleration(motion: Smooth, span: float) -> float:
 
 @compiled
 def event_value(motion: Smooth, event: EventFunction, order: int, t: float) -> tuple[float, float]:
-    """A event_value function, differentiated `order` times, and its slope, at time t.
+    """Return the derivative of an event function of this order, and its slope, at time t.
 
-    Order 3 stands for (D + rate)·D², which leaves a damped oscillation of everything.
+    Order 3 stands for (D + rate)·D², which turns any event function into a damped oscillation.
     """
     m = motion
     w = event
-    y0, y1 = state(m, t)
+    y0, y1 = state_at(m, t)
     left = m.excess * math.exp(-m.rate * t) if m.excess != 0.0 else 0.0
     force = m.constant + m.slope * t
     if m.excess != 0.0:
@@ -160,10 +159,10 @@ def event_value(motion: Smooth, event: EventFunction, order: int, t: float) -> t
 
 
 @compiled
-def root(
+def find_root(
     motion: Smooth, event: EventFunction, order: int, low: float, high: float, rising: bool
 ) -> float:
-    """The root of an event function in (low, high]: Newton kept in its bracket."""
+    """Return the root of an event function in (low, high], by Newton's method in a bracket."""
     rounding = 4e-16 * high
     t = 0.5 * (low + high)
     for _ in range(_MAX_ITERATIONS):
@@ -185,17 +184,17 @@ def root(
 
 
 @compiled
-def first_turn(motion: Smooth, event: EventFunction, sign: float, span: float) -> float:
-    """First time in (0, span] at which a event_value function has turned against `sign`, else inf.
+def first_sign_change(motion: Smooth, event: EventFunction, sign: float, span: float) -> float:
+    """Return the first time in (0, span] at which an event function changes its sign, else inf.
 
-    span is at most a quarter period of the oscillator.
+    `sign` is its sign at the start; span is at most a quarter period of the oscillator.
     """
     edges = np.empty(6)
     zeros = np.empty(6)
     edges[0], edges[1] = 0.0, span
     count = 2
     for order in range(3 if motion.excess != 0.0 else 2, -1, -1):
-        # Of two edges between which the sign changes, the next lower order has its one zero there.
+        # The function of this order has exactly one zero between two edges with a sign change.
         zeros[0] = 0.0
         found = 1
         before = sign if order == 0 else event_value(motion, event, order, 0.0)[0]
@@ -203,7 +202,7 @@ def first_turn(motion: Smooth, event: EventFunction, sign: float, span: float) -
         for i in range(1, count):
             value, _ = event_value(motion, event, order, edges[i])
             if value * before < 0.0:
-                zero = root(motion, event, order, since, edges[i], before < 0.0)
+                zero = find_root(motion, event, order, since, edges[i], before < 0.0)
                 if order == 0:
                     return zero
                 zeros[found] = zero

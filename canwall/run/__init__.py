@@ -1,7 +1,8 @@
-"""One run from configuration to folder: the rooms put together, and nothing else.
+"""A run from configuration to folder.
 
-`buses` opens what a run is on, `assembly` builds axes and exchange, `running` is the run, `result`
-what it came to, `stopping` the signals that end it.
+`buses` opens the bus, `assembly` builds axes and exchange, `running` executes the run, `result`
+summarises it, `changes` accepts changes of the wall, `stopping` handles the signals that end it.
+`closed_loop` simulates a run in memory, `referent` the continuous wall that it is compared with.
 """
 
 from canwall.run.assembly import (
@@ -9,9 +10,9 @@ from canwall.run.assembly import (
     make_axis,
     make_exchange,
     make_monitor,
+    prepared_machine,
     render,
-    restored,
-    scheduled,
+    restoring_drives,
 )
 from canwall.run.buses import make_simulated_drive, on_the_bus, open_bus, serve_drive
 from canwall.run.result import RunResult
@@ -28,11 +29,11 @@ __all__ = [
     "make_simulated_drive",
     "on_the_bus",
     "open_bus",
+    "prepared_machine",
     "render",
-    "restored",
+    "restoring_drives",
     "run",
     "run_together",
-    "scheduled",
     "serve_drive",
     "stop_on_signals",
 ]

@@ -1,4 +1,4 @@
-"""The parts of a run put together: axes on a link, their exchange, what watches them."""
+"""Assembly of a run: the axes on a link, their exchange, their monitor."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -23,13 +23,13 @@ from canwall.eds import load_eds
 from canwall.record import Ring
 from canwall.walls import Law
 
-#: How long compiled code keeps the cycle before the loop looks after signals, messages and changes
-#: [s of bus time].
-_LOOKS_S, _SIMULATED_LOOKS_S = 0.02, 1.0
+#: Time for which compiled code keeps the cycle before the loop handles signals, messages and
+#: changes, in real and in simulated time [s of bus time].
+_NATIVE_SPAN_S, _SIMULATED_NATIVE_SPAN_S = 0.02, 1.0
 
 
 def drive_dictionary(settings: Settings) -> ObjectDictionary:
-    """The object dictionary of `[drive]`, with all that a wall needs. Raises DictionaryError."""
+    """Load the object dictionary of `[drive]`. Raises DictionaryError if it lacks an object."""
     return load_eds(settings.drive.eds, settings.drive.node_id, REQUIRED_OBJECTS)
 
 
@@ -40,9 +40,17 @@ def make_axis(
     laws: Sequence[Law],
     ring: Ring,
 ) -> WallAxis:
-    """Set the drive up for its wall, the rows of its cycles going into the ring.
+    """Set a drive up for its wall, without enabling it.
 
-    `dictionary` is what `[drive] eds` describes. Nothing is enabled yet. Raises DriveError.
+    Args:
+        link: The bus.
+        settings: Configuration of drive and wall.
+        dictionary: Object dictionary of the drive, from `drive_dictionary`.
+        laws: Laws of the run, from `run_laws`.
+        ring: Ring for the rows of its cycles.
+
+    Raises:
+        DriveError: If the drive cannot be set up.
     """
     node = DriveNode(link, settings.drive.node_id, dictionary)
     try:
@@ -59,9 +67,11 @@ def make_axis(
 
 
 def make_exchange(link: Link, axes: Sequence[WallAxis]) -> Exchange:
-    """The cycle of all axes, on the SYNC and by the exchange that `[bus]` says.
+    """Make the exchange of frames for all axes, as `[bus]` says.
 
-    Raises DriveError, and ConfigError for an exchange that the bus does not have.
+    Raises:
+        DriveError: If the drives need different SYNCs.
+        ConfigError: If the bus does not support the exchange.
     """
     settings, setup = axes[0].settings, axes[0].setup
     for axis in axes[1:]:
@@ -71,14 +81,14 @@ def make_exchange(link: Link, axes: Sequence[WallAxis]) -> Exchange:
             setup.sync_counter_overflow,
         ):
             raise DriveError(
-                f"{axis.name} wants another SYNC than {axes[0].name}: make 0x1005 and 0x1019 equal"
+                f"{axis.name} needs another SYNC than {axes[0].name}: make 0x1005 and 0x1019 equal"
             )
     external = settings.bus.sync == "external"
     if settings.bus.exchange != "python-can":
         try:
             exchange = Exchange(link, axes, settings.real_time, external, SocketTransport)
-            looks_s = _LOOKS_S if settings.real_time else _SIMULATED_LOOKS_S
-            exchange.ahead = max(1, round(looks_s / settings.bus.cycle_s))
+            span_s = _NATIVE_SPAN_S if settings.real_time else _SIMULATED_NATIVE_SPAN_S
+            exchange.ahead = max(1, round(span_s / settings.bus.cycle_s))
             return exchange
         except can.CanInitializationError as error:
             if settings.bus.exchange == "native":
@@ -87,7 +97,7 @@ def make_exchange(link: Link, axes: Sequence[WallAxis]) -> Exchange:
 
 
 def make_monitor(link: Link, axes: Sequence[WallAxis]) -> BusMonitor:
-    """What ends the walls beside the cycle; a second SYNC as well, where the master sends it."""
+    """Make the monitor of the bus; it watches for a second SYNC if the master produces SYNC."""
     external = axes[0].settings.bus.sync == "external"
     return BusMonitor(link, axes, None if external else axes[0].setup.sync_cob_id)
 
@@ -99,7 +109,7 @@ def render(
 ) -> Outcome:
     """Enable the drives, render the walls for `[run] duration_s` or until stopped, disable them.
 
-    progress is told the seconds of bus time about every 100 ms of them.
+    progress is called with the bus time [s] about every 100 ms of it.
     """
     settings = exchange.axes[0].settings
     period, end_s = settings.bus.cycle_s, settings.run.duration_s
@@ -108,24 +118,24 @@ def render(
 
 
 @contextmanager
-def restored() -> Iterator[tuple[list[WallAxis], dict[str, list[str]]]]:
-    """Axes whose drives are put back at the end, where `[drive] restore` asks for it.
+def restoring_drives() -> Iterator[tuple[list[WallAxis], dict[str, list[str]]]]:
+    """Undo the changes in the drives at the end, for each with `[drive] restore`.
 
-    Yields the list to fill with them, and what will be left by their names: that which could not
-    be put back.
+    Yields a list to fill with the axes, and a dictionary that will have, by name of the axis, what
+    could not be undone.
     """
     axes: list[WallAxis] = []
-    left: dict[str, list[str]] = {}
+    failures: dict[str, list[str]] = {}
     try:
-        yield axes, left
+        yield axes, failures
     finally:
         for axis in axes:
             if axis.settings.drive.restore:
-                left[axis.name] = axis.node.restore()
+                failures[axis.name] = axis.node.restore()
 
 
-def scheduled(settings: Settings) -> AbstractContextManager[dict[str, Grant]]:
-    """The machine's set-up for a run that keeps to the clock; tells what was granted."""
+def prepared_machine(settings: Settings) -> AbstractContextManager[dict[str, Grant]]:
+    """Prepare the machine for a run in real time; the context is what it granted."""
     if settings.real_time:
         return real_time_machine(settings.bus.processor)
     return nullcontext({"scheduling": Grant("simulated time")})

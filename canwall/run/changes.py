@@ -1,7 +1,7 @@
-"""A run that goes on, and whoever wants to change its wall: `canwall change`.
+"""Changes of the wall of a run in progress, posted by another process (`canwall change`).
 
-The run leaves an address in its folder; a change is checked against the run's own configuration
-before it is posted there, so that the loop need not doubt it.
+The run leaves the address of a mailbox in its folder. A change is validated against the run's own
+configuration before it is posted, so the loop can apply it without checks.
 """
 
 import json
@@ -19,13 +19,13 @@ from canwall.errors import RunFailedError
 from canwall.record import Mailbox, RunFolder
 from canwall.walls import UnknownLawError, find_law
 
-#: How long a loop may take to notice a change: it waits for one that is under way.
+#: Longest wait for the loop to take a change; it takes one at a time [s].
 _PATIENCE_S = 5.0
 
 
 @contextmanager
 def open_to_changes(axes: Sequence[WallAxis], folders: Sequence[RunFolder]) -> Iterator[None]:
-    """Let other processes change the walls, for as long as the context lasts."""
+    """Accept changes of the walls from other processes for as long as the context lasts."""
     with ExitStack() as stack:
         for axis, folder in zip(axes, folders, strict=True):
             axis.mailbox = Mailbox.create()
@@ -35,27 +35,38 @@ def open_to_changes(axes: Sequence[WallAxis], folders: Sequence[RunFolder]) -> I
         yield
 
 
-def change(folder: RunFolder, assignments: Sequence[str]) -> int:
-    """Post a change, KEY=VALUE each, to the run that writes this folder; the cycle of its effect.
+def post_change(folder: RunFolder, assignments: Sequence[str]) -> int:
+    """Post a change to the run that writes a folder.
 
-    Keys are those of `[[schedule]]`, values as in TOML. Raises ConfigError where the run or a key
-    is not there or a value impossible, RunFailedError where the run does not take it.
+    Args:
+        folder: Folder of the run.
+        assignments: KEY=VALUE, keys of `[[schedule]]` and values as in TOML.
+
+    Returns:
+        The cycle from which on the change is in force.
+
+    Raises:
+        ConfigError: If there is no such run, or a key or a value is wrong.
+        RunFailedError: If the run does not take the change in time.
     """
     try:
         address = json.loads(folder.live.read_text())["mailbox"]
         mailbox = Mailbox.open(address)
     except (OSError, ValueError, KeyError):
-        raise ConfigError(f"{folder.path}: no run goes on here; give the folder of one") from None
+        raise ConfigError(
+            f"{folder.path}: no run in progress; give the folder of one that is"
+        ) from None
     try:
-        wanted = _checked(assignments, load(folder.config))
-        return mailbox.post(wanted.model_dump_json(exclude_none=True), _PATIENCE_S)
+        change = _parse_change(assignments, load(folder.config))
+        return mailbox.post(change.model_dump_json(exclude_none=True), _PATIENCE_S)
     except TimeoutError:
         raise RunFailedError(f"{folder.path}: the run does not take the change") from None
     finally:
         mailbox.close()
 
 
-def _checked(assignments: Sequence[str], settings: Settings) -> WallChange:
+def _parse_change(assignments: Sequence[str], settings: Settings) -> WallChange:
+    """Parse assignments and check that the run can apply them. Raises ConfigError."""
     values: dict[str, Any] = {}
     for assignment in assignments:
         key, _, value = assignment.partition("=")
@@ -63,14 +74,14 @@ def _checked(assignments: Sequence[str], settings: Settings) -> WallChange:
         *path, name = key.strip().removeprefix("wall.").split(".")
         for part in path:
             table = table.setdefault(part, {})
-        table[name] = _value(value)
+        table[name] = _parse_value(value)
     if isinstance(values.get("law"), str):
         values["law"] = absolute_law(values["law"], Path())
     try:
-        wanted = WallChange.model_validate(values)
+        change = WallChange.model_validate(values)
     except ValidationError as error:
         raise ConfigError(first_error(error, WallChange)) from None
-    wall, _ = wanted.applied_to(settings.wall, settings.limits)
+    wall, _ = change.applied_to(settings.wall, settings.limits)
     low, high = settings.limits.position_rad
     if not low < wall.position_rad < high:
         raise ConfigError(
@@ -82,17 +93,18 @@ def _checked(assignments: Sequence[str], settings: Settings) -> WallChange:
         law.option_values(wall.options)
     except UnknownLawError as error:
         raise ConfigError(f"law: {error}") from None
-    if wanted.law is not None:
+    if change.law is not None:
         known = [law.name for law in run_laws(settings)]
         if law.name not in known:
             raise ConfigError(
-                f"law {law.name} is none of the run's: {', '.join(known)}; list it in run.more_laws"
+                f"law {law.name} is not one of the run's: {', '.join(known)}; "
+                "list it in run.more_laws"
             )
-    return wanted
+    return change
 
 
-def _value(text: str) -> Any:
+def _parse_value(text: str) -> Any:
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
-        return text.strip()  # a word without its quotes
+        return text.strip()  # a string without quotes

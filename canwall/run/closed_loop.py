@@ -1,7 +1,8 @@
-"""The closed loop in memory: the same compiled cycle and the same servo, without a bus between.
+"""Closed loop in memory: the compiled cycle and the simulated servo, without a bus between them.
 
-What the bus does to the loop is kept to the bit: positions in counts, torques in per mille, and
-the delay D from a sample to its torque. What it is not: frames, the drive's state machine, I²t.
+The effects of the bus on the loop are reproduced exactly: positions in counts, torques in per
+mille, and the delay D from a sample to its torque. Frames, the drive's state machine and I²t are
+not simulated.
 """
 
 import functools
@@ -32,7 +33,7 @@ from canwall.walls import MAX_DELAY
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
-#: Where the cycle finds position, statusword and torque, and puts its torque.
+#: PDOs in which the cycle finds position, statusword and torque, and puts its torque.
 _TPDO = PdoLayout(
     0,
     (
@@ -44,16 +45,16 @@ _TPDO = PdoLayout(
 _RPDO = PdoLayout(0, (Field(od.TARGET_TORQUE, 0, 0, 16),))
 _ENABLED = DriveState.OPERATION_ENABLED.value[1]
 _ENABLING, _RENDERING = int(Phase.ENABLING), int(Phase.RENDERING)
-#: Per mille of a rated torque in mN·m, to N·m.
+#: N·m per mN·m and per mille.
 _PER_MILLE_MILLI = 1e-6
 
-#: SYNCs that the drive of config/sim.toml takes from the first one to OPERATION ENABLED.
+#: SYNCs from the first one to OPERATION ENABLED with the drive of config/sim.toml.
 ENABLING_CYCLES = 7
 
 
 @dataclass(frozen=True)
-class Simulated:
-    """What a closed loop came to: one row (dtype ROW) per cycle, up to a trip if there is one."""
+class SimulatedRun:
+    """Result of a closed loop: a row (dtype ROW) per cycle up to the trip, if there is one."""
 
     rows: NDArray[np.void]
     units: DriveUnits
@@ -61,10 +62,21 @@ class Simulated:
 
 
 class LoopRecords(NamedTuple):
-    """A closed loop as compiled code takes it, to be closed as often as wanted.
+    """A closed loop in the form that compiled code takes; it can be simulated repeatedly.
 
-    The records of cycle and servo, the same memory as bytes, and their bytes at the beginning;
-    push and slope of the hand's force in each cycle; and what `ClosedLoop` knows.
+    Attributes:
+        cycle: Record of the cycle, shape (1,).
+        servo: Record of the servo, shape (1,).
+        cycle_bytes: The memory of `cycle` as bytes.
+        servo_bytes: The memory of `servo` as bytes.
+        cycle_before: Bytes of `cycle` at the start.
+        servo_before: Bytes of `servo` at the start.
+        push: Force of the hand at the SYNC of each cycle [N·m], shape (cycles,).
+        slope: Its slope over the cycle [N·m/s], shape (cycles,).
+        nm_per_mille: Torque of one per mille at the shaft [N·m].
+        whole: Whole periods of the delay D.
+        share: Rest of the delay D [periods].
+        enabling: Cycles before the wall is rendered.
     """
 
     cycle: NDArray[np.void]
@@ -81,34 +93,38 @@ class LoopRecords(NamedTuple):
     enabling: int
 
 
-def simulate(settings: Settings, cycles: int, enabling: int = ENABLING_CYCLES) -> Simulated:
-    """Render the wall of a configuration for `cycles` SYNCs, the first `enabling` without torque.
+def simulate(settings: Settings, cycles: int, enabling: int = ENABLING_CYCLES) -> SimulatedRun:
+    """Render the wall of a configuration in memory.
 
-    The delay of the loop is that of a synchronous RPDO, or of none at all (`torque_pdo` =
-    "immediate"), and `simulation.torque_delay_cycles` beyond. Raises ConfigError for what only a
-    run has: changes of the wall, a person at the handle.
+    The delay of the loop is one period for a synchronous RPDO, none for one that acts on reception,
+    plus `simulation.torque_delay_cycles`.
+
+    Args:
+        settings: Configuration with `[simulation]`, without changes of the wall.
+        cycles: Number of SYNCs.
+        enabling: Number of SYNCs without torque at the start.
+
+    Raises:
+        ConfigError: If only a run can render the configuration.
     """
     loop = ClosedLoop(settings, cycles, enabling)
-    ready, rows = loop.records(), np.zeros(cycles, ROW)
-    done = simulate_loop(ready, rows, np.empty((3, cycles)))
-    return Simulated(rows[:done], loop.units, Trip(int(ready.cycle["trip"][0])))
+    records, rows = loop.records(), np.zeros(cycles, ROW)
+    done = simulate_loop(records, rows, np.empty((3, cycles)))
+    return SimulatedRun(rows[:done], loop.units, Trip(int(records.cycle["trip"][0])))
 
 
 class ClosedLoop:
-    """Cycle, servo and hand of a configuration, ready to be closed with one wall or several."""
+    """Cycle, servo and hand of a configuration, to be simulated with one wall or several."""
 
     def __init__(self, settings: Settings, cycles: int, enabling: int = ENABLING_CYCLES) -> None:
-        """Raise ConfigError as `simulate` does."""
+        """Prepare a loop; arguments and errors are those of `simulate`."""
         simulation = settings.simulation
         if simulation is None:
             raise ConfigError("[simulation] is missing: there is no drive to simulate")
         if settings.schedule or settings.wall.alternate:
-            raise ConfigError("schedule, wall.alternate: only a run changes its wall")
-        scales = known_scales(settings)
-        motor_nm = scales.rated_torque_mnm / 1000.0
-        self.units = DriveUnits.behind_gear(
-            scales.counts_per_rev / scales.gear_ratio, motor_nm, scales.gear_ratio
-        )
+            raise ConfigError("schedule, wall.alternate: only a run can change its wall")
+        scales = cached_servo_scales(settings)
+        self.units = simulated_units(settings)
         limit_nm = scales.torque_limit_per_mille * self.units.nm_per_mille
         setup = DriveSetup(self.units, 0, _TPDO, _RPDO, torque_limit_nm=limit_nm)
         self._cycle = make_cycle(settings, setup, run_laws(settings))
@@ -119,8 +135,8 @@ class ClosedLoop:
         delay = loop_delay(settings)
         if delay > MAX_DELAY:
             raise ConfigError(
-                f"simulation.torque_delay_cycles: a delay of {delay:g} cycles in all is more than "
-                f"{MAX_DELAY}, which is what the laws can reckon with"
+                f"simulation.torque_delay_cycles: the delay is {delay:g} cycles in all; the laws "
+                f"compensate for {MAX_DELAY} at most"
             )
         self._push, self._slope = hand_force(simulation.hand, settings.bus.cycle_s, cycles)
         self._nm_per_mille = scales.rated_torque_mnm * _PER_MILLE_MILLI * scales.gear_ratio
@@ -129,7 +145,7 @@ class ClosedLoop:
         self._enabling = enabling
 
     def records(self) -> LoopRecords:
-        """Records of its own for whoever closes it: several threads may."""
+        """Return records for a thread of its own; several may simulate the loop at a time."""
         cycle, servo = copied(self._cycle), copied(self._servo)
         return LoopRecords(
             cycle,
@@ -148,17 +164,28 @@ class ClosedLoop:
 
 
 def loop_delay(settings: Settings) -> float:
-    """D of the simulated drive: from a sample to its torque, in cycles (theory, section 3)."""
+    """Return D of the simulated drive: cycles from a sample to its torque (theory, section 3)."""
     assert settings.simulation is not None
     synchronous = settings.drive.torque_pdo != "immediate"
     return settings.simulation.torque_delay_cycles + (1.0 if synchronous else 0.0)
 
 
-def known_scales(settings: Settings) -> ServoScales:
-    """`servo_scales`, each dictionary read once."""
+def simulated_units(settings: Settings) -> DriveUnits:
+    """Return the units of the simulated drive at the shaft."""
+    scales = cached_servo_scales(settings)
+    return DriveUnits.behind_gear(
+        scales.counts_per_rev / scales.gear_ratio,
+        scales.rated_torque_mnm / 1000.0,
+        scales.gear_ratio,
+    )
+
+
+def cached_servo_scales(settings: Settings) -> ServoScales:
+    """Return `servo_scales`, reading each dictionary only once."""
     drive, simulation = settings.drive, settings.simulation
     assert simulation is not None
-    # Reading a dictionary costs as much as a hundred strikes: kept by all that it depends on.
+    # Reading a dictionary takes as long as a hundred strikes. The key is all that the scales
+    # depend on.
     known = simulation.model_dump(
         mode="json", include={"objects", "counts_per_rev", "rated_torque_nm"}
     )
@@ -166,35 +193,43 @@ def known_scales(settings: Settings) -> ServoScales:
         written = drive.eds.stat().st_mtime_ns
     except OSError:
         written = 0
-    return _scales(_Scaled(settings, (str(drive.eds), written, drive.node_id, str(known))))
+    key = (str(drive.eds), written, drive.node_id, str(known))
+    return _read_scales(_KeyedSettings(settings, key))
 
 
-class _Scaled:
-    """Settings that are alike in what the scales depend on."""
+class _KeyedSettings:
+    """Settings that compare equal if the scales of their drives do."""
 
     def __init__(self, settings: Settings, key: tuple[object, ...]) -> None:
         self.settings, self.key = settings, key
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Scaled) and self.key == other.key
+        return isinstance(other, _KeyedSettings) and self.key == other.key
 
     def __hash__(self) -> int:
         return hash(self.key)
 
 
 @functools.lru_cache(maxsize=256)
-def _scales(scaled: _Scaled) -> ServoScales:
-    assert scaled.settings.simulation is not None
-    return servo_scales(scaled.settings.drive, scaled.settings.simulation)
+def _read_scales(keyed: _KeyedSettings) -> ServoScales:
+    assert keyed.settings.simulation is not None
+    return servo_scales(keyed.settings.drive, keyed.settings.simulation)
 
 
 @compiled
 def simulate_loop(loop: LoopRecords, rows: NDArray[np.void], signals: Array) -> int:
-    """Run from the beginning on the configuration's wall; how many cycles there were.
+    """Simulate the loop from its start on the configuration's wall.
 
-    rows has dtype ROW and as many elements as are to be kept: cycle j goes into j modulo their
-    number. signals has shape (3, cycles): position relative to the wall; force held from each SYNC
-    on, out of the wall; torque commanded. `loop.cycle` is left as it is at the end, with the trip.
+    `loop.cycle` keeps its final state, including the trip.
+
+    Args:
+        loop: The loop.
+        rows: Rows of the last cycles, shape (n,), dtype ROW: cycle j is in j modulo n.
+        signals: Result, shape (3, cycles): position relative to the wall [rad]; force held from
+            each SYNC on, out of the wall [N·m]; commanded torque [N·m].
+
+    Returns:
+        Number of cycles, up to a trip.
     """
     _restore_initial_state(loop)
     return _run_cycles(loop, rows, signals)
@@ -204,10 +239,10 @@ def simulate_loop(loop: LoopRecords, rows: NDArray[np.void], signals: Array) -> 
 def simulate_wall(
     loop: LoopRecords, stiffness: float, damping: float, rows: NDArray[np.void], signals: Array
 ) -> int:
-    """`simulate_loop` on a wall of another stiffness and damping."""
+    """Call `simulate_loop` on a wall of this stiffness [N·m/rad] and damping [N·m·s/rad]."""
     _restore_initial_state(loop)
     cycle: Record = loop.cycle[0]
-    # Where `set_wall` writes them.
+    # The fields that `set_wall` sets.
     wall = cycle.rendered[0].wall[0]
     wall.stiffness = stiffness
     wall.damping = damping
@@ -224,18 +259,21 @@ def _restore_initial_state(loop: LoopRecords) -> None:
 
 @compiled
 def _run_cycles(loop: LoopRecords, rows: NDArray[np.void], signals: Array) -> int:
-    """Fill the signals; how many cycles. The torque of sample j acts from j + whole + share on."""
+    """Fill the signals and return the number of cycles.
+
+    The torque of sample j acts from the time j + whole + share on.
+    """
     cycles, servos, push, slope = loop.cycle, loop.servo, loop.push, loop.slope
     nm_per_mille, whole, share = loop.nm_per_mille, loop.whole, loop.share
     cycle: Record = cycles[0]
     period, counts = cycle.period, encoder_counts(servos)
-    # Torques on their way in per mille: sent[k] was computed k samples ago.
+    # Torques in per mille that are on their way: sent[k] was computed k samples ago.
     sent = np.zeros(MAX_DELAY + 2, np.int64)
     at = 0
     for j in range(len(push)):
         if j == loop.enabling:
             cycle.phase = _RENDERING
-        # What the drive shows acts at the instant of the SYNC; one that is on its way does not.
+        # The drive shows the torque that acts at the SYNC, not the one that is still on its way.
         shown = sent[whole] if share > 0.0 or whole == 0 else sent[whole - 1]
         data = (counts & 0xFFFFFFFF) | (_ENABLED << 32) | ((shown & 0xFFFF) << 48)
         step(cycles, rows[at : at + 1], data, True)

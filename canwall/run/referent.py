@@ -1,4 +1,4 @@
-"""The continuous referent of a configuration (`analysis.referent`), with the simulated hand."""
+"""Continuous referent of a configuration (`analysis.referent`), with the simulated hand."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +15,19 @@ Array = NDArray[np.float64]
 def referent_positions(
     settings: Settings, stiffness: Array, damping: Array, wall_position: Array
 ) -> Array | None:
-    """Positions relative to the wall, at each SYNC of a run, of the continuous referent; (n,).
+    """Return the positions of the continuous referent at each SYNC of a run, relative to the wall.
 
     The referent is the same hand with the same script on the same handle, against the continuous
-    wall that each cycle asked for: stiffness [N·m/rad], damping [N·m·s/rad] and position [rad],
-    each of shape (n,). None where the hand is a person's.
+    wall of each cycle.
+
+    Args:
+        settings: Configuration of the run.
+        stiffness: Stiffness of the wall in each cycle [N·m/rad], shape (n,).
+        damping: Damping of the wall in each cycle [N·m·s/rad], shape (n,).
+        wall_position: Position of the wall in each cycle [rad], shape (n,).
+
+    Returns:
+        Positions [rad], shape (n,); None without `[simulation]`, for the hand is a person's.
     """
     if settings.simulation is None:
         return None
@@ -29,7 +37,7 @@ def referent_positions(
 
 
 class Referent:
-    """The hand and the handle of a configuration, to be followed against one wall or several."""
+    """Hand and handle of a configuration, to be simulated against one wall or several."""
 
     def __init__(self, settings: Settings, simulation: Simulation, cycles: int) -> None:
         self._period = settings.bus.cycle_s
@@ -43,13 +51,13 @@ class Referent:
         self._body = body._replace(side=self._side * body.side)
 
     def positions(self, stiffness: Array, damping: Array, wall_position: Array) -> Array:
-        """As `referent_positions`."""
+        """Return the same as `referent_positions`."""
         y = np.empty(len(stiffness))
         follow_referent(self.inputs(wall_position), stiffness, damping, y)
         return y
 
     def inputs(self, wall_position: Array) -> ReferentInputs:
-        """Inputs of `follow_referent`, for a wall at these positions [rad] in each cycle; (n,)."""
+        """Return the inputs of `follow_referent`; wall_position [rad] has shape (n,)."""
         origin = self._side * wall_position
         return ReferentInputs(
             copied(self._handle),
@@ -57,7 +65,7 @@ class Referent:
             self._body,
             self._hand.grip,
             origin,
-            # Measured from the wall, the hand's spring pulls from another place.
+            # The hand's spring in coordinates measured from the wall.
             self._side * self._constant - self._hand.stiffness_nm_per_rad * origin,
             self._slope,
             self._period,

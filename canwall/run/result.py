@@ -1,4 +1,4 @@
-"""What a run came to: its summary, and what there is to be said of it."""
+"""Result of a run: its summary and remarks."""
 
 import json
 from dataclasses import dataclass
@@ -17,7 +17,15 @@ from canwall.run.referent import referent_positions
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run came to: notes are what the record lacks, remarks what the drive would not do."""
+    """Result of a run.
+
+    Attributes:
+        folder: Its record.
+        summary: Content of summary.json.
+        outcome: How the loop ended.
+        notes: What the record lacks.
+        remarks: What the drive does not do as configured.
+    """
 
     folder: RunFolder
     summary: dict[str, Any]
@@ -36,11 +44,14 @@ def result_of(
     notes: list[str],
     remarks: list[str],
 ) -> RunResult:
-    """Summary of one axis, and its last cycles where it tripped."""
+    """Write the summary of one axis, and its last cycles if it tripped.
+
+    Raises RecordError or RunFailedError if nothing was recorded.
+    """
     settings = axis.settings
-    signals = _recorded(folder, [*outcome.trips, *notes])
-    asked_for = (signals[name].to_numpy() for name in ("stiffness", "damping", "wall_position_rad"))
-    referent = referent_positions(settings, *asked_for)
+    signals = _read_recorded(folder, [*outcome.trips, *notes])
+    wall = (signals[name].to_numpy() for name in ("stiffness", "damping", "wall_position_rad"))
+    referent = referent_positions(settings, *wall)
     summary = summarise(signals, settings, axis.setup.units, referent)
     summary |= {
         "missed_tpdo": int(axis.cycle["missed_tpdo"][0]),
@@ -50,14 +61,14 @@ def result_of(
         "trip_cycle": outcome.trip_cycle,
         "interrupted": outcome.interrupted,
         "delay_cycles": axis.delay,
-        "drive": _described(axis.setup),
+        "drive": _drive_summary(axis.setup),
         "timing": {
             "exchange": exchange.name,
             **{name: grant.found for name, grant in machine.items()},
             "advice": [f"{g.found}; {g.advice}" for g in machine.values() if g.advice],
             "sync_interval": timing_summary(exchange.sync_interval),
             "tpdo_to_rpdo": timing_summary(axis.latency),
-            **(_by_the_clock(axis, exchange) if settings.real_time else {}),
+            **(_real_time_summary(axis, exchange) if settings.real_time else {}),
         },
     }
     folder.summary.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
@@ -66,16 +77,16 @@ def result_of(
     return RunResult(folder, summary, outcome, notes, remarks)
 
 
-def _by_the_clock(axis: WallAxis, exchange: Exchange) -> dict[str, Any]:
-    """What there is in real time alone; an RPDO has until the next SYNC, which is a cycle."""
+def _real_time_summary(axis: WallAxis, exchange: Exchange) -> dict[str, Any]:
+    """Return the timing that exists in real time only; an RPDO has to be sent within a cycle."""
     return {
         "sync_error": timing_summary(exchange.sync_error),
         "sync_to_rpdo": timing_summary(axis.sync_to_rpdo),
     }
 
 
-def _recorded(folder: RunFolder, troubles: list[str]) -> pa.Table:
-    """The signals of the run; without any, its troubles are all that is left to say."""
+def _read_recorded(folder: RunFolder, troubles: list[str]) -> pa.Table:
+    """Read the signals of the run; without any, raise an error with its troubles."""
     try:
         signals = read_signals(folder.signals)
     except ConfigError as error:
@@ -86,12 +97,12 @@ def _recorded(folder: RunFolder, troubles: list[str]) -> pa.Table:
 
 
 def remarks_on(setup: DriveSetup, settings: Settings) -> list[str]:
-    """What the drive would not do, and does otherwise than was asked."""
+    """Return what the drive does not do as configured."""
     remarks = [f"the drive: {note}" for note in setup.notes]
     if setup.torque_limit_nm < settings.limits.torque_nm and setup.scales is not None:
-        whence = setup.scales.sources[-1][1]
+        source = setup.scales.sources[-1][1]
         remarks.append(
-            f"the drive holds the torque to {setup.torque_limit_nm:g} N·m ({whence}), below "
+            f"the drive limits the torque to {setup.torque_limit_nm:g} N·m ({source}), below "
             f"limits.torque_nm = {settings.limits.torque_nm:g}; [drive.parameters] may raise it"
         )
     if setup.watchdog.kind == "none":
@@ -99,7 +110,7 @@ def remarks_on(setup: DriveSetup, settings: Settings) -> list[str]:
     return remarks
 
 
-def _described(setup: DriveSetup) -> dict[str, Any]:
+def _drive_summary(setup: DriveSetup) -> dict[str, Any]:
     return {
         "mode": str(setup.mode),
         "watchdog": str(setup.watchdog),

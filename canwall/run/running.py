@@ -1,6 +1,6 @@
-"""One run from configuration to folder.
+"""Execution of a run, from configuration to folder.
 
-Prepare everything that can fail on bad input, then touch the bus, then the drive.
+Everything that can fail on bad input comes first, then the bus, then the drive.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,9 +16,9 @@ from canwall.run.assembly import (
     make_axis,
     make_exchange,
     make_monitor,
+    prepared_machine,
     render,
-    restored,
-    scheduled,
+    restoring_drives,
 )
 from canwall.run.buses import on_the_bus
 from canwall.run.changes import open_to_changes
@@ -35,10 +35,21 @@ def run(
 ) -> RunResult:
     """Enable the drive, render the wall, record, summarise, draw (`canwall run`).
 
-    report is told the steps, progress the seconds of bus time done and their end; stopped is asked
-    whether to end the wall, besides the signals that do. Raises ConfigError and DictionaryError
-    before anything is enabled, DriveError where the drive cannot be set up, RunFailedError where
-    no cycle came about or none was recorded.
+    Args:
+        settings: Configuration of the run.
+        output: Folder of its record; None: a new folder below `runs`.
+        report: Called with each step.
+        progress: Called with the bus time done and its end [s], None without an end.
+        stopped: Asked whether to end the run, in addition to signals.
+
+    Returns:
+        The result; a trip is part of its outcome.
+
+    Raises:
+        ConfigError: For bad input; nothing has been enabled.
+        DictionaryError: If the object dictionary cannot be used; nothing has been enabled.
+        DriveError: If the drive cannot be set up.
+        RunFailedError: If no cycle was rendered or recorded.
     """
     (result,) = run_together([settings], output, report, progress, stopped)
     return result
@@ -51,10 +62,10 @@ def run_together(
     progress: Callable[[float, float | None], None] = lambda now_s, end_s: None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> list[RunResult]:
-    """`run` for several drives on one bus, each with its wall, on one SYNC.
+    """Call `run` for several drives on one bus, each with its wall, on one SYNC.
 
-    Their `[bus]` and `[run]` have to be the same. Each drive's record has a folder of its own,
-    `node5` …; the bus log lies beside these folders.
+    Their `[bus]` and `[run]` have to be equal. Each drive's record has a folder of its own,
+    `node5` …; the bus log is next to these folders.
     """
     _check_together(many)
     laws = [run_laws(settings) for settings in many]
@@ -75,7 +86,7 @@ def run_together(
                 )
             link.log = recorders[0].ring.log_frame
             report("setting up the drive" if len(many) == 1 else "setting up the drives")
-            with restored() as (axes, not_restored):
+            with restoring_drives() as (axes, not_restored):
                 for settings, dictionary, known, recorder in zip(
                     many, dictionaries, laws, recorders, strict=True
                 ):
@@ -87,7 +98,7 @@ def run_together(
                     closing(exchange),
                     open_to_changes(axes, folders),
                     stop_on_signals() as stop,
-                    scheduled(first) as machine,
+                    prepared_machine(first) as machine,
                 ):
                     outcome = render(
                         exchange,
@@ -98,11 +109,13 @@ def run_together(
             notes = [recorder.close() for recorder in recorders]
     report("summarising")
     results = []
-    for axis, folder, noted in zip(axes, folders, notes, strict=True):
-        said = [*noted, *monitor.notes] if axis is axes[0] else noted
+    for axis, folder, of_record in zip(axes, folders, notes, strict=True):
+        of_axis = [*of_record, *monitor.notes] if axis is axes[0] else of_record
         remarks = [*remarks_on(axis.setup, axis.settings), *not_restored.get(axis.name, [])]
         remarks += outcome.notes if axis is axes[0] else []
-        results.append(result_of(axis, exchange, monitor, machine, folder, outcome, said, remarks))
+        results.append(
+            result_of(axis, exchange, monitor, machine, folder, outcome, of_axis, remarks)
+        )
     report("drawing")
     for folder in folders:
         plot_run(folder)

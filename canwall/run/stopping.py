@@ -1,37 +1,36 @@
-"""What asks a run to end: signals, which end nothing themselves."""
+"""Signals that request the end of a run, so that the drive is disabled first."""
 
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-#: What asks a run to end.
-_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopRequest:
-    """Whether somebody asked the run to end."""
+    """A flag that is set when the end of the run is requested."""
 
     def __init__(self) -> None:
         self.requested = False
 
     def __call__(self) -> bool:
-        """Whether it was asked for."""
+        """Return whether the end was requested."""
         return self.requested
 
 
 @contextmanager
 def stop_on_signals() -> Iterator[StopRequest]:
-    """Ctrl-C, SIGTERM and a terminal that is closed ask for an end instead of ending.
+    """Turn Ctrl-C, SIGTERM and a closed terminal into a request, for as long as the context lasts.
 
-    The drive is to be disabled first. What the program was started to ignore (nohup) it ignores.
+    Signals that the program was started to ignore (nohup) stay ignored.
     """
     stop = StopRequest()
 
     def request(number: int, frame: object) -> None:
         stop.requested = True
 
-    ends = [s for s in _ENDING if signal.getsignal(s) is not signal.SIG_IGN]
-    previous = {s: signal.signal(s, request) for s in ends}
+    handled = [s for s in _SIGNALS if signal.getsignal(s) is not signal.SIG_IGN]
+    previous = {s: signal.signal(s, request) for s in handled}
     try:
         yield stop
     finally:

@@ -89,7 +89,7 @@ def servo_scales(drive: DriveSettings, simulation: Simulation) -> ServoScales:
 def _dictionary(drive: DriveSettings, simulation: Simulation, node_id: int) -> Dictionary:
     """The drive's dictionary, with what the simulation knows where it is silent."""
     dictionary = Dictionary.load(drive.eds, node_id)
-    for (index, subindex), value in simulation.written.items():
+    for (index, subindex), value in simulation.objects_by_index.items():
         dictionary.power_on_with(index, subindex, value)
     dictionary.supply(0x1000, 0, _SERVO_DRIVE)
     dictionary.supply(0x6076, 0, round(1000.0 * simulation.rated_torque_nm))

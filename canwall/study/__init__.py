@@ -1,7 +1,7 @@
-"""Walls judged by a person at the handle: staircases, laws that alternate, and the questions."""
+"""Walls judged by a person at the handle: staircases, alternating laws, and the dialogue."""
 
 from canwall.study.session import Session, Verdict
-from canwall.study.staircase import Staircase, alternating, limits, staircases
+from canwall.study.staircase import Staircase, run_alternating, run_staircases, stiffness_limits
 from canwall.study.terminal import SessionEndedError, Terminal
 
 __all__ = [
@@ -10,7 +10,7 @@ __all__ = [
     "Staircase",
     "Terminal",
     "Verdict",
-    "alternating",
-    "limits",
-    "staircases",
+    "run_alternating",
+    "run_staircases",
+    "stiffness_limits",
 ]

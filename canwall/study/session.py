@@ -1,8 +1,8 @@
-"""Stiffness sweeps on a drive with a person at the handle: what is asked, run, and kept of it.
+"""Session of a study: walls rendered one after another, each judged by the person at the handle.
 
 Each step is a run with a folder of its own; between two steps the drive is disabled. The person
-says whether the wall was free of chatter, and the verdicts stand in a table beside what was
-measured.
+says whether the wall was free of chatter; the table of verdicts has the answer next to the
+measured quantities.
 """
 
 import csv
@@ -17,12 +17,13 @@ from canwall.errors import InputError, RunFailedError
 from canwall.run import RunResult, run
 from canwall.study.terminal import SessionEndedError, Terminal
 
+#: Name of the table of verdicts in the folder of a session.
 TABLE = "verdicts.csv"
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the person said of the strikes of one law in one run, and what was measured of them."""
+    """Answer of the person for the strikes of one law in one run, and the measured quantities."""
 
     step: int
     run: str
@@ -38,7 +39,7 @@ class Verdict:
 
 
 class Session:
-    """A folder with the runs of one person, and the table of the verdicts, written as they come."""
+    """Runs of one person in a folder, with a table of verdicts that is written as they come."""
 
     def __init__(
         self,
@@ -48,9 +49,18 @@ class Session:
         seconds: float,
         terminal: Terminal,
     ) -> None:
-        """seconds: how long a wall is rendered; none of laws: that of base.
+        """Create the folder and its table.
 
-        Raises InputError where the folder cannot be used, ConfigError for a law that is not there.
+        Args:
+            base: Configuration of the runs; its schedule is not used.
+            laws: Names of the laws to judge; empty: the law of `base`.
+            folder: Folder of the session.
+            seconds: Time for which each wall is rendered [s].
+            terminal: Terminal of the person.
+
+        Raises:
+            InputError: If the folder holds a session or cannot be written.
+            ConfigError: If a law does not exist.
         """
         self._base = base.model_copy(
             update={
@@ -76,11 +86,22 @@ class Session:
             raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
 
     def step(self, laws: Sequence[str], stiffness: float) -> dict[str, bool]:
-        """Render one wall, the laws taking turns from strike to strike; which of them were free.
+        """Render one wall, the laws taking turns from strike to strike, and ask for the verdicts.
 
-        Strikes go by their number, so that the person does not know the law. A law that had no
-        strike before the wall ended by itself is left out. Raises SessionEndedError,
-        KeyboardInterrupt, and what `run` raises.
+        Questions refer to strikes by number, so that the person does not learn the law.
+
+        Args:
+            laws: Laws that take turns.
+            stiffness: Stiffness of the wall [N·m/rad].
+
+        Returns:
+            True for each law whose strikes were free of chatter. A law without a strike, because
+            the run tripped before its turn, is missing.
+
+        Raises:
+            SessionEndedError: If the person ended the session.
+            KeyboardInterrupt: On Ctrl-C.
+            RunFailedError: If the drive could not be disabled, or as `run` does.
         """
         while True:
             settings = self._settings(laws, stiffness)
@@ -93,12 +114,12 @@ class Session:
             )
             self._terminal.ask("Hand off the handle. Enter begins, q ends:", ("",))
             result = self._run(settings, stiffness)
-            heard = self._heard(result, laws)
-            if heard is None:
+            answers = self._ask_for_verdicts(result, laws)
+            if answers is None:
                 continue
-            for law, free in heard.items():
-                self._keep(result, law, stiffness, free)
-            return heard
+            for law, free in answers.items():
+                self._record_verdict(result, law, stiffness, free)
+            return answers
 
     def _settings(self, laws: Sequence[str], stiffness: float) -> Settings:
         settings = with_law(self._base, laws[0])
@@ -106,11 +127,14 @@ class Session:
         return settings.model_copy(update={"wall": settings.wall.model_copy(update=wall)})
 
     def _run(self, settings: Settings, stiffness: float) -> RunResult:
-        """Raises SessionEndedError and KeyboardInterrupt where more than the wall was ended."""
+        """Render one wall.
+
+        Raises SessionEndedError or KeyboardInterrupt if not only the wall was ended.
+        """
         typed: list[str | None] = []
 
         def stopped() -> bool:
-            line = self._terminal.pressed()
+            line = self._terminal.poll_line()
             if line in ("", "q"):
                 typed.append(line)
             return bool(typed)
@@ -129,31 +153,32 @@ class Session:
             if typed[0] == "q":
                 raise SessionEndedError
         for trip in outcome.trips:
-            self._terminal.say(f"The wall ended by itself: {trip}")
+            self._terminal.say(f"The run tripped: {trip}")
         return result
 
-    def _heard(self, result: RunResult, laws: Sequence[str]) -> dict[str, bool] | None:
-        """What the person says of each law; None: once more."""
+    def _ask_for_verdicts(self, result: RunResult, laws: Sequence[str]) -> dict[str, bool] | None:
+        """Ask whether each law was free of chatter; None to render the wall again."""
         strikes = result.summary["strikes"]
-        numbers = {law: _numbers(strikes, law) for law in laws}
-        met = [law for law in laws if numbers[law]]
-        if not met or (len(met) < len(laws) and not result.outcome.trips):
+        numbers = {law: _strike_numbers(strikes, law) for law in laws}
+        struck = [law for law in laws if numbers[law]]
+        if not struck or (len(struck) < len(laws) and not result.outcome.trips):
             self._terminal.say("Not every law had a strike: once more.")
             return None
-        heard = {}
-        for law in met:
-            which = "The wall" if len(laws) == 1 else f"Strikes {_listed(numbers[law])}"
+        answers = {}
+        for law in struck:
+            listed = ", ".join(map(str, numbers[law]))
+            which = "The wall" if len(laws) == 1 else f"Strikes {listed}"
             answer = self._terminal.ask(
                 f"{which}: free of chatter? y, n, again:", ("y", "n", "again")
             )
             if answer == "again":
                 return None
-            heard[law] = answer == "y"
-        return heard
+            answers[law] = answer == "y"
+        return answers
 
-    def _keep(self, result: RunResult, law: str, stiffness: float, free: bool) -> None:
-        strikes = [s for s in result.summary["strikes"] if _is(s, law)]
-        chattering = [s for s in strikes if s["chatter"]]
+    def _record_verdict(self, result: RunResult, law: str, stiffness: float, free: bool) -> None:
+        strikes = [strike for strike in result.summary["strikes"] if strike["law"] == law]
+        chattering = [strike for strike in strikes if strike["chatter"]]
         verdict = Verdict(
             self._steps,
             result.folder.path.name,
@@ -172,13 +197,5 @@ class Session:
             csv.writer(file).writerow(asdict(verdict).values())
 
 
-def _is(strike: dict[str, Any], law: str) -> bool:
-    return bool(strike["law"] == law)
-
-
-def _numbers(strikes: Sequence[dict[str, Any]], law: str) -> list[int]:
-    return [number for number, strike in enumerate(strikes, start=1) if _is(strike, law)]
-
-
-def _listed(numbers: Sequence[int]) -> str:
-    return ", ".join(map(str, numbers))
+def _strike_numbers(strikes: Sequence[dict[str, Any]], law: str) -> list[int]:
+    return [number for number, strike in enumerate(strikes, start=1) if strike["law"] == law]

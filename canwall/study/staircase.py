@@ -1,4 +1,4 @@
-"""In which order a person meets stiffer and softer walls."""
+"""Order in which a person meets stiffer and softer walls."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -10,13 +10,20 @@ from canwall.study.session import Session, Verdict
 
 @dataclass(frozen=True)
 class Staircase:
-    """Up while a wall is free of chatter, down while it is not, in ever smaller steps.
+    """Adaptive procedure: up while a wall is free of chatter, down while it is not.
 
-    Steps are factors: 2 at first, the square root of it after each reversal. The first reversal
-    with a factor of `finest` or less ends it: the limit lies between the last two walls. A person
-    who errs once is brought back by the steps that follow. It ends as well at the ceiling, and
-    where nothing is free down to a 64th of the start, or of the last wall that was. start, ceiling
-    in N·m/rad. Raises InputError.
+    Steps are factors: 2 at first, the square root of the last one after each reversal. The first
+    reversal with a factor of `finest` or less ends the staircase: the limit lies between the last
+    two walls. The steps after a wrong answer correct it. The staircase also ends at the ceiling,
+    and after walls that chatter down to 1/64 of the start or of the last wall that was free.
+
+    Attributes:
+        start: Stiffness of the first wall [N·m/rad].
+        ceiling: Largest stiffness [N·m/rad].
+        finest: Factor of the last steps, greater than 1.
+
+    Raises:
+        InputError: If a value is out of range.
     """
 
     start: float
@@ -26,14 +33,14 @@ class Staircase:
     def __post_init__(self) -> None:
         if not 0.0 < self.start <= self.ceiling < math.inf:
             raise InputError(
-                f"--start {self.start:g}: has to be above 0, and at most the ceiling, "
+                f"--start {self.start:g}: has to be above 0 and at most the ceiling, "
                 f"{self.ceiling:g}"
             )
         if not self.finest > 1.0:
             raise InputError(f"--finest {self.finest:g}: has to be a factor above 1")
 
     def climb(self, is_free: Callable[[float], bool]) -> None:
-        """Ask of one wall after the other."""
+        """Present one wall after another; `is_free` takes a stiffness and tells if it is free."""
         stiffness, factor = self.start, 2.0
         free = is_free(stiffness)
         floor = stiffness / 64.0
@@ -49,8 +56,8 @@ class Staircase:
                 factor = math.sqrt(factor)
 
 
-def staircases(session: Session, staircase: Staircase) -> None:
-    """The staircase of each law, one after the other."""
+def run_staircases(session: Session, staircase: Staircase) -> None:
+    """Run the staircase of each law of the session."""
     for law in session.laws:
 
         def is_free(stiffness: float, law: str = law) -> bool:
@@ -59,31 +66,31 @@ def staircases(session: Session, staircase: Staircase) -> None:
         staircase.climb(is_free)
 
 
-def alternating(session: Session, stiffnesses: Sequence[float]) -> None:
-    """All laws on the same walls, strike by strike in turn, each wall stiffer than the last.
+def run_alternating(session: Session, stiffnesses: Sequence[float]) -> None:
+    """Render walls of rising stiffness, the laws of the session taking turns on each.
 
-    A law that was found to chatter is left out of the walls after it (the source, 5.5).
+    A law that was found to chatter takes no part in the walls after it (source text, 5.5).
     """
-    left = session.laws
+    laws = session.laws
     for stiffness in sorted(stiffnesses):
-        heard = session.step(left, stiffness)
-        left = [law for law in left if heard.get(law, True)]
-        if not left:
+        free = session.step(laws, stiffness)
+        laws = [law for law in laws if free.get(law, True)]
+        if not laws:
             return
 
 
-def limits(verdicts: Sequence[Verdict]) -> dict[str, tuple[float, float]]:
-    """For each law: the stiffest wall that was free of chatter, the softest that was not.
+def stiffness_limits(verdicts: Sequence[Verdict]) -> dict[str, tuple[float, float]]:
+    """Return the stiffest wall free of chatter and the softest that chatters, for each law.
 
-    [N·m/rad]; 0 and infinity where there was none. A person may contradict himself: then the
-    first is above the second.
+    In N·m/rad; 0 and infinity if there is none. If the answers contradict each other, the first
+    may be above the second.
     """
-    found: dict[str, tuple[float, float]] = {}
+    limits: dict[str, tuple[float, float]] = {}
     for verdict in verdicts:
-        free, chatters = found.get(verdict.law, (0.0, math.inf))
+        free, chatters = limits.get(verdict.law, (0.0, math.inf))
         if verdict.free_of_chatter:
             free = max(free, verdict.stiffness_nm_per_rad)
         else:
             chatters = min(chatters, verdict.stiffness_nm_per_rad)
-        found[verdict.law] = free, chatters
-    return found
+        limits[verdict.law] = free, chatters
+    return limits

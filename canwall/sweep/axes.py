@@ -1,4 +1,4 @@
-"""The axes of a sweep: names, units, and what a value on one of them does to a configuration."""
+"""Axes of a sweep: names, units, and the change that a value makes to a configuration."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -10,43 +10,43 @@ import numpy as np
 from canwall.config import ConfigError, Settings, overridden
 from canwall.cycle import with_law
 from canwall.errors import InputError
-from canwall.run.closed_loop import known_scales, loop_delay
+from canwall.run.closed_loop import cached_servo_scales, loop_delay
 from canwall.simdrive import TORQUE_LIMITS
-from canwall.sweep.strike import OPERATORS, model_of, strike_settings
+from canwall.sweep.strike import OPERATORS, law_model, strike_settings
 from canwall.walls import MAX_DELAY
 
-#: More values than this on one axis are a slip of the pen.
+#: Largest number of values on one axis: more of them are a typing error.
 _MOST_VALUES = 1_000_000
 
 Value = str | int | float | bool
 Point = Mapping[str, Value]
 
-#: Axes that are no key of the configuration: (unit, what it is).
+#: Axes that are not keys of the configuration: (unit, description).
 NAMED = {
-    "law": ("", "law of the wall, with +deadbeat where it is compensated"),
+    "law": ("", "law of the wall, +deadbeat with the compensation"),
     "stiffness": ("N*m/rad", "K"),
-    "stiffness_normalised": ("1", "K*T^2/m, m what really moves"),
+    "stiffness_normalised": ("1", "K*T^2/m, m of drive, handle and hand"),
     "damping": ("N*m*s/rad", "B"),
-    "damping_normalised": ("1", "B*T/m, m what really moves"),
+    "damping_normalised": ("1", "B*T/m, m of drive, handle and hand"),
     "rate": ("Hz", "rate of the SYNC"),
     "delay": ("1", "D, cycles from a sample to its torque"),
     "counts": ("1", "encoder increments per turn, 0x608F"),
     "torque_step": ("N*m", "a thousandth of the rated torque, 0x6076"),
-    "operator": ("", "who is at the handle"),
-    "model": ("", "what the laws' model knows: matched, drive, file"),
+    "operator": ("", "operator at the handle"),
+    "model": ("", "model of the laws: matched, drive, file"),
     "model_error": ("1", "relative error of the model's inertia"),
-    "servo": ("", "file: as configured; ideal: no cogging, any torque, at once"),
+    "servo": ("", "file: as configured; ideal: no cogging, no torque steps, no lag"),
     "speed": ("rad/s", "mean speed of the hand's approach"),
-    "phase": ("1", "phase of the contact against the SYNC"),
-    "start": ("rad", "how far from the wall the handle rests before"),
-    "press": ("s", "how long the hand presses"),
+    "phase": ("1", "phase of the contact relative to the SYNC"),
+    "start": ("rad", "distance from the wall at which the handle rests before the strike"),
+    "press": ("s", "time for which the hand presses"),
 }
-#: Axes of the wall itself: a strike prepared once meets all of their values.
+#: Axes of the wall itself: a strike is prepared once for all of their values.
 STIFFNESS = ("stiffness", "stiffness_normalised")
 DAMPING = ("damping", "damping_normalised")
-#: Axes over which the worst counts.
+#: Axes over which the worst value counts.
 STRIKES = ("speed", "phase")
-#: What holds where neither the configuration nor the command line says otherwise.
+#: Values of axes that neither the configuration nor the command line gives.
 DEFAULTS: dict[str, tuple[Value, ...]] = {
     "model": ("matched",),
     "model_error": (0.0,),
@@ -65,57 +65,59 @@ _CHOICES = {
 
 @dataclass(frozen=True)
 class SweepAxis:
-    """One axis: its name and its values, in order."""
+    """One axis: its name and its ordered values."""
 
     name: str
     values: tuple[Value, ...]
 
     @property
     def unit(self) -> str:
-        """Unit of the values; empty for names."""
+        """Unit of the values; empty for names and for keys of the configuration."""
         return NAMED.get(self.name, ("", ""))[0]
 
 
-def parsed(name: str, given: object) -> SweepAxis:
-    """An axis from an array, one value, "A,B,C" or "LO:HI:N"; N steps, geometric for stiffness.
+def parse_axis(name: str, given: object) -> SweepAxis:
+    """Parse the values of an axis: an array, a single value, "A,B,C" or a range "LO:HI:N".
 
-    "LO:HI:N:log" and "LO:HI:N:lin" say which. Raises InputError.
+    A range has N values, geometrically spaced for a stiffness and evenly for everything else;
+    "LO:HI:N:log" and "LO:HI:N:lin" choose the spacing. Raises InputError.
     """
     if isinstance(given, str):
-        values = tuple(v for part in given.split(",") for v in _written(name, part.strip()))
+        values = tuple(v for part in given.split(",") for v in _parse_part(name, part.strip()))
     elif isinstance(given, Sequence):
-        values = tuple(v for part in given for v in parsed(name, part).values)
+        values = tuple(v for part in given for v in parse_axis(name, part).values)
     else:
         values = (given,)  # type: ignore[assignment]
     if not values or "" in values:
         raise InputError(f"sweep axis {name}: has no values")
     if len(set(values)) < len(values):
-        raise InputError(f"sweep axis {name}: a value is there twice")
+        raise InputError(f"sweep axis {name}: has a value twice")
     for value in values:
         _check(name, value)
     return SweepAxis(name, values)
 
 
-def _written(name: str, text: str) -> list[Value]:
+def _parse_part(name: str, text: str) -> list[Value]:
+    """Parse a single value or a range."""
     parts = text.split(":")
-    numbers = [_number(part) for part in parts[:3]]
+    numbers = [_parse_value(part) for part in parts[:3]]
     if len(parts) in (3, 4) and all(isinstance(n, int | float) for n in numbers):
         low, high, count = numbers
         kind = parts[3] if len(parts) == 4 else ("log" if name in STIFFNESS else "lin")
         if not isinstance(count, int) or count < 1 or kind not in ("log", "lin"):
-            raise InputError(f"sweep axis {name}: {text!r} is no range; write LO:HI:N")
+            raise InputError(f"sweep axis {name}: {text!r} is not a range; write LO:HI:N")
         if count > _MOST_VALUES:
             raise InputError(f"sweep axis {name}: {count} values; {_MOST_VALUES} at most")
         if kind == "log" and not (low > 0 and high > 0):  # type: ignore[operator]
             raise InputError(f"sweep axis {name}: {text!r}: a geometric range has to be above 0")
         spaced = np.geomspace if kind == "log" else np.linspace
-        found = spaced(float(low), float(high), count)
-        whole = all(isinstance(n, int) for n in numbers) and np.all(found == np.rint(found))
-        return [int(v) if whole else float(v) for v in found]
-    return [_number(text)]
+        values = spaced(float(low), float(high), count)
+        whole = all(isinstance(n, int) for n in numbers) and np.all(values == np.rint(values))
+        return [int(v) if whole else float(v) for v in values]
+    return [_parse_value(text)]
 
 
-def _number(text: str) -> Value:
+def _parse_value(text: str) -> Value:
     for kind in (int, float):
         try:
             return kind(text)
@@ -125,11 +127,11 @@ def _number(text: str) -> Value:
 
 
 def _check(name: str, value: Value) -> None:
-    """Raise InputError for a value that the axis cannot have, whatever the configuration."""
+    """Raise InputError for a value that no configuration allows on the axis."""
     if name in _CHOICES:
         if value not in _CHOICES[name]:
             raise InputError(
-                f"sweep axis {name}: no {value!r}; there are {', '.join(_CHOICES[name])}"
+                f"sweep axis {name}: has to be one of {', '.join(_CHOICES[name])}, not {value!r}"
             )
         return
     if name not in NAMED or name == "law":
@@ -138,20 +140,20 @@ def _check(name: str, value: Value) -> None:
     if not number or not math.isfinite(value):  # type: ignore[arg-type]
         raise InputError(f"sweep axis {name}: has to be a number, not {value!r}")
     low = {"model_error": -1.0}.get(name, 0.0)
-    may_be_low = name in ("damping", "damping_normalised", "delay", "phase")
-    if not (value > low or (may_be_low and value == low)):  # type: ignore[operator]
-        least = "at least" if may_be_low else "greater than"
-        raise InputError(f"sweep axis {name}: has to be {least} {low:g}, not {value!r}")
+    low_allowed = name in ("damping", "damping_normalised", "delay", "phase")
+    if not (value > low or (low_allowed and value == low)):  # type: ignore[operator]
+        bound = "at least" if low_allowed else "greater than"
+        raise InputError(f"sweep axis {name}: has to be {bound} {low:g}, not {value!r}")
     if name == "delay" and value > MAX_DELAY:  # type: ignore[operator]
-        raise InputError(f"sweep axis delay: has to be {MAX_DELAY} at most, not {value!r}")
+        raise InputError(f"sweep axis delay: has to be at most {MAX_DELAY}, not {value!r}")
     if name == "counts" and value != int(value):
         raise InputError(f"sweep axis counts: has to be a whole number, not {value!r}")
 
 
 def resolve(base: Settings, point: Point) -> Settings:
-    """The settings of one strike: those of the configuration, and what the point says.
+    """Return the settings of one strike: those of `base`, changed as the point says.
 
-    The wall's stiffness and damping are not looked at. Raises ConfigError.
+    The axes of the wall, stiffness and damping, are not applied. Raises ConfigError.
     """
     values = {**{name: given[0] for name, given in DEFAULTS.items()}, **point}
     settings = base.model_copy(update={"schedule": (), "sweep": {}})
@@ -166,7 +168,7 @@ def resolve(base: Settings, point: Point) -> Settings:
     if values["servo"] == "ideal":
         ideal = settings.simulation.with_ideal_servo()
         settings = settings.model_copy(update={"simulation": ideal})
-    model = model_of(settings, str(values["model"]), float(values["model_error"]))
+    model = law_model(settings, str(values["model"]), float(values["model_error"]))
     settings = settings.model_copy(update={"mechanics": model})
     settings = _overridden(settings, {k: v for k, v in keys.items() if _of_the_model(k)})
     if settings.estimator.delay_cycles is None:
@@ -196,7 +198,10 @@ def _with_rate(settings: Settings, rate: Value) -> Settings:
 
 
 def _with_delay(settings: Settings, delay: Value) -> Settings:
-    """D ≥ 1 on a synchronous RPDO, less on one that acts on reception; the laws know it."""
+    """Set D: from 1 on with a synchronous RPDO, below with one that acts on reception.
+
+    The laws reckon with the same D.
+    """
     synchronous = float(delay) >= 1.0
     return _overridden(
         settings,
@@ -220,9 +225,9 @@ def _with_counts(settings: Settings, counts: Value) -> Settings:
 
 
 def _with_torque_step(settings: Settings, step: Value) -> Settings:
-    """Another rated torque, and the limits in per mille of it as they were in N·m."""
+    """Change the rated torque, and keep the limits, which are in per mille of it, in N·m."""
     assert settings.simulation is not None
-    scales = known_scales(settings)
+    scales = cached_servo_scales(settings)
     rated = round(1e6 * float(step))
     if rated < 1 or abs(rated * 1e-6 - float(step)) > 1e-12:
         raise ConfigError(
@@ -238,7 +243,7 @@ def _with_operator(settings: Settings, name: Value) -> Settings:
     return overridden(settings, OPERATORS[str(name)].keys)
 
 
-#: In the order in which they are made: a key of the configuration goes before all of them.
+#: In the order in which they are applied, before any key of the configuration.
 _CHANGES: dict[str, Callable[[Settings, Value], Settings]] = {
     "law": lambda settings, law: with_law(settings, str(law)),
     "rate": _with_rate,

@@ -1,4 +1,4 @@
-"""The pieces of a sweep on a Dask cluster, and what can be wrong with one."""
+"""Computation of the pieces of a sweep on a Dask cluster, with its failures as one line each."""
 
 import asyncio
 import logging
@@ -11,33 +11,38 @@ from numpy.typing import NDArray
 
 from canwall.errors import InputError, RunFailedError
 from canwall.sweep.dataset import versions
-from canwall.sweep.plan import Found, Plan, compute
+from canwall.sweep.plan import PieceResult, Plan, compute_piece
 
-#: How long to wait for a scheduler to be there, and to answer [s].
-_THERE_S, _PATIENCE_S = 3.0, 10.0
+#: Timeouts for reaching a scheduler, and for connecting a client to it [s].
+_GREETING_S, _CONNECTING_S = 3.0, 10.0
+_NO_SCHEDULER = "it answers, but not as a Dask scheduler"
 
 
-def on_a_cluster(plan: Plan, pieces: Sequence[int], address: str) -> Iterator[Found]:
-    """The pieces with their numbers, as they are done by the workers of the scheduler there.
+def compute_on_cluster(plan: Plan, pieces: Sequence[int], address: str) -> Iterator[PieceResult]:
+    """Yield the pieces with their numbers as the workers of the scheduler finish them.
 
-    Raises InputError where there is none; RunFailedError where it goes, or where scheduler or
-    workers have not the software that is here.
+    Raises:
+        InputError: If there is no scheduler at the address.
+        RunFailedError: If the scheduler is lost, or if scheduler or workers have other software
+            than this machine.
     """
     try:
         import distributed
     except ImportError:
         raise InputError("--dask needs dask.distributed: install canwall[dask]") from None
-    # What they have to say comes as an exception too, or has been put right, as where a worker died
-    # with a result. Some have levels of their own.
+    # What they log is also raised, or was recovered from (a worker lost with its result). Some of
+    # the loggers have a level of their own.
     for name in list(logging.root.manager.loggerDict):
         if name.partition(".")[0] == "distributed":
             logging.getLogger(name).setLevel(logging.CRITICAL)
-    client = _connected(address)
+    client = _connect(address)
     try:
-        # What is still to be done when the client leaves, nobody wants any more: it is dropped.
+        # The scheduler drops what is unfinished when the client leaves.
         with client:
             jobs = {
-                client.submit(_compute_there, versions(), plan, piece, pure=False, retries=2): piece
+                client.submit(
+                    _compute_checked, versions(), plan, piece, pure=False, retries=2
+                ): piece
                 for piece in pieces
             }
             for job in distributed.as_completed(list(jobs), loop=client.loop):
@@ -48,49 +53,49 @@ def on_a_cluster(plan: Plan, pieces: Sequence[int], address: str) -> Iterator[Fo
     except distributed.KilledWorker as error:
         raise RunFailedError(f"--dask {address}: {error}") from None
     except (ImportError, RuntimeError) as error:
-        # The scheduler that cannot import what the pieces are made of says RuntimeError.
+        # A scheduler that cannot import the modules of a piece raises RuntimeError.
         raise RunFailedError(
-            f"--dask {address}: scheduler and workers need the canwall that is here: "
+            f"--dask {address}: scheduler and workers need the canwall of this machine: "
             f"{error.__cause__ or error}"
         ) from None
 
 
-def _compute_there(here: dict[str, str], plan: Plan, piece: int) -> NDArray[np.void]:
-    """Compute a piece on a worker. Raises RunFailedError where it would make other numbers."""
-    if (there := versions()) != here:
-        wrong = [name for name in here if there[name] != here[name]]
-        other, needed = (", ".join(f"{n} {found[n]}" for n in wrong) for found in (there, here))
-        raise RunFailedError(f"a worker has {other}; needed: {needed}")
-    return compute(plan, piece)
+def _compute_checked(needed: dict[str, str], plan: Plan, piece: int) -> NDArray[np.void]:
+    """Compute a piece on a worker. Raises RunFailedError if its versions are not the needed."""
+    if (found := versions()) != needed:
+        wrong = [name for name in needed if found[name] != needed[name]]
+        theirs, ours = (", ".join(f"{n} {v[n]}" for n in wrong) for v in (found, needed))
+        raise RunFailedError(f"a worker has {theirs}; needed: {ours}")
+    return compute_piece(plan, piece)
 
 
-def _connected(address: str) -> Any:
-    """A distributed.Client of the scheduler there. Raises InputError where there is none."""
+def _connect(address: str) -> Any:
+    """Return a distributed.Client of the scheduler. Raises InputError if there is none."""
     import distributed
 
     try:
-        # A client that cannot read its address, or meets somebody else there, hangs.
+        # A client with a malformed address, or of something that is no scheduler, hangs.
         distributed.comm.get_address_host_port(address, strict=True)
-        asyncio.run(asyncio.wait_for(_greet(address), _THERE_S))
-        return distributed.Client(address, timeout=_PATIENCE_S, set_as_default=False)
+        asyncio.run(asyncio.wait_for(_greet(address), _GREETING_S))
+        return distributed.Client(address, timeout=_CONNECTING_S, set_as_default=False)
     except (OSError, ValueError, TimeoutError, MemoryError) as error:
-        # Who speaks another protocol is taken to announce more than there is memory.
+        # Bytes of another protocol, read as a length, ask for more memory than there is.
         if isinstance(error, MemoryError):
-            error = ValueError("what is there is none")
+            error = ValueError(_NO_SCHEDULER)
         reason = str(error).splitlines()[0] if str(error) else "no answer"
         raise InputError(f"--dask {address}: no scheduler there: {reason}") from None
 
 
 async def _greet(address: str) -> None:
-    """Raise OSError, ValueError where no scheduler answers."""
+    """Raise OSError or ValueError unless a scheduler answers."""
     import distributed
 
     arguments = distributed.Security().get_connection_args("client")
-    comm = await distributed.core.connect(address, timeout=_THERE_S, **arguments)
+    comm = await distributed.core.connect(address, timeout=_GREETING_S, **arguments)
     try:
         await comm.write({"op": "identity", "reply": True})
         answer = await comm.read()
     finally:
         comm.abort()
     if not isinstance(answer, dict) or answer.get("type") != "Scheduler":
-        raise ValueError("what is there is none")
+        raise ValueError(_NO_SCHEDULER)

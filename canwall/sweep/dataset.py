@@ -1,51 +1,56 @@
-"""The result of a sweep as one xarray Dataset, from which every figure can be drawn again."""
+"""Result of a sweep as an xarray Dataset with everything its figures need, and its NetCDF file."""
 
 import functools
 import importlib.metadata
 import json
 import platform
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from canwall.analysis.strike import DESCRIBED
-from canwall.run.closed_loop import known_scales, loop_delay
+from canwall.analysis.strike import MEASURE_DESCRIPTIONS
+from canwall.errors import InputError
+from canwall.run.closed_loop import loop_delay, simulated_units
 from canwall.sweep.axes import NAMED
 from canwall.sweep.plan import Plan
-from canwall.units import DriveUnits
 
-_LIMITS = {
+#: (unit, description) of what a search finds besides MEASURES.
+_LIMIT_DESCRIPTIONS = {
     "limit": ("N*m/rad", "K-limit of this strike alone"),
     "open_ended": ("1", "no chatter up to the end of the search: the limit is that end"),
     "worst": ("N*m/rad", "K-limit: free of chatter at all speeds and phases"),
 }
-#: What holds under a condition: the numbers that analytic limits need.
-_CIRCUMSTANCES = {
-    "inertia": ("kg*m^2", "of what really moves"),
-    "viscous": ("N*m*s/rad", "damping of what really moves"),
-    "device_viscous": ("N*m*s/rad", "damping of the drive and the handle alone"),
+#: (unit, description) of the parameters at each condition, for the analytic limits.
+_PARAMETER_DESCRIPTIONS = {
+    "inertia": ("kg*m^2", "inertia of drive, handle and hand together"),
+    "viscous": ("N*m*s/rad", "damping of drive, handle and hand together"),
+    "device_viscous": ("N*m*s/rad", "damping of drive and handle alone"),
     "coulomb": ("N*m", "Coulomb friction"),
     "period": ("s", "T"),
     "loop_delay": ("1", "D in cycles"),
     "count": ("rad", "one encoder count"),
     "force_step": ("N*m", "one step of torque"),
-    "model_inertia": ("kg*m^2", "inertia that the laws' model knows"),
+    "model_inertia": ("kg*m^2", "inertia in the laws' model"),
 }
+#: Packages whose versions may change the numbers.
 _PACKAGES = ("canwall", "numpy", "scipy", "numba", "xarray")
+
+_NETCDF_ENGINE: Literal["h5netcdf"] = "h5netcdf"
 
 
 @functools.cache
 def versions() -> dict[str, str]:
-    """Of what has made the numbers."""
+    """Return the versions of Python and of the packages that the numbers depend on."""
     found = {name: importlib.metadata.version(name) for name in _PACKAGES}
     return found | {"python": platform.python_version()}
 
 
-def described(plan: Plan) -> str:
-    """All that decides the numbers of a sweep, as JSON."""
+def plan_json(plan: Plan) -> str:
+    """Return everything that the numbers of a sweep depend on, as JSON."""
     return json.dumps(
         {
             "axes": [[axis.name, *axis.values] for axis in plan.axes],
@@ -56,8 +61,11 @@ def described(plan: Plan) -> str:
     )
 
 
-def gathered(plan: Plan, pieces: Mapping[int, NDArray[np.void]]) -> xr.Dataset:
-    """Dataset of all pieces, one dimension per axis, units in attributes."""
+def assemble_dataset(plan: Plan, pieces: Mapping[int, NDArray[np.void]]) -> xr.Dataset:
+    """Assemble the Dataset from all pieces of work, with a dimension per axis.
+
+    Units and descriptions are in the attributes `units` and `long_name`.
+    """
     searched = plan.stiffness is None
     walls = len(plan.damping.values) if searched else len(plan.walls)
     table = np.zeros((len(plan.points), walls, len(plan.strikes)), plan.dtype)
@@ -68,25 +76,26 @@ def gathered(plan: Plan, pieces: Mapping[int, NDArray[np.void]]) -> xr.Dataset:
     table = table.reshape(plan.shape)
     names = tuple(axis.name for axis in plan.axes)
     data: dict[str, Any] = {}
-    for name, (unit, what) in (_LIMITS | DESCRIBED).items():
+    for name, (unit, description) in (_LIMIT_DESCRIPTIONS | MEASURE_DESCRIPTIONS).items():
         if name not in (plan.dtype.names or ()):
             continue
-        # The worst is that of all strikes.
-        over = names[:-2] if name == "worst" else names
+        # The worst is that of all strikes: it has no dimension for their speed and phase.
+        dims = names[:-2] if name == "worst" else names
         values = table[name][..., 0, 0] if name == "worst" else table[name]
-        data[name] = (over, np.ascontiguousarray(values), {"units": unit, "long_name": what})
+        attributes = {"units": unit, "long_name": description}
+        data[name] = (dims, np.ascontiguousarray(values), attributes)
     conditions = names[: len(plan.conditions)]
-    known = [_circumstances(plan, point) for point in plan.points]
+    parameters = [_parameters(plan, point) for point in plan.points]
     shape = plan.shape[: len(conditions)]
-    for i, (name, (unit, what)) in enumerate(_CIRCUMSTANCES.items()):
-        values = np.array([k[i] for k in known]).reshape(shape)
-        data[name] = (conditions, values, {"units": unit, "long_name": what})
+    for i, (name, (unit, description)) in enumerate(_PARAMETER_DESCRIPTIONS.items()):
+        values = np.array([of_point[i] for of_point in parameters]).reshape(shape)
+        data[name] = (conditions, values, {"units": unit, "long_name": description})
     if searched:
         unit_of = data["inertia"][1] / data["period"][1] ** 2
         data["worst_normalised"] = (
             names[:-2],
             data["worst"][1] / unit_of[..., None],
-            {"units": "1", "long_name": "K-limit as K*T^2/m, m what really moves"},
+            {"units": "1", "long_name": "K-limit as K*T^2/m, m of drive, handle and hand"},
         )
     coordinates = {
         axis.name: (
@@ -108,16 +117,38 @@ def gathered(plan: Plan, pieces: Mapping[int, NDArray[np.void]]) -> xr.Dataset:
     )
 
 
-def _circumstances(plan: Plan, point: Mapping[str, Any]) -> tuple[float, ...]:
+def write_sweep(dataset: xr.Dataset, output: Path) -> None:
+    """Write the Dataset as NetCDF, completely or not at all. Raises InputError."""
+    new = output.with_name(output.name + ".new")
+    try:
+        dataset.to_netcdf(new, engine=_NETCDF_ENGINE)
+        new.replace(output)
+    except OSError as error:
+        new.unlink(missing_ok=True)
+        raise InputError(f"{output}: cannot be written: {error.strerror or error}") from None
+
+
+def read_sweep(path: Path) -> xr.Dataset:
+    """Read the result of a sweep. Raises InputError if the file is not one."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give the result of a sweep")
+    try:
+        with xr.open_dataset(path, engine=_NETCDF_ENGINE) as stored:
+            dataset = stored.load()
+    except (OSError, ValueError, KeyError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{path}: not the result of a sweep: {reason}") from None
+    if "configuration" not in dataset.attrs or "through" not in dataset.attrs:
+        raise InputError(f"{path}: not the result of a sweep")
+    return dataset
+
+
+def _parameters(plan: Plan, point: Mapping[str, Any]) -> tuple[float, ...]:
+    """Return the values of _PARAMETER_DESCRIPTIONS at one condition."""
     settings = plan.settings(point, plan.strikes[0])
     simulation = settings.simulation
     assert simulation is not None
-    hand, scales = simulation.hand, known_scales(settings)
-    units = DriveUnits.behind_gear(
-        scales.counts_per_rev / scales.gear_ratio,
-        scales.rated_torque_mnm / 1000.0,
-        scales.gear_ratio,
-    )
+    hand, units = simulation.hand, simulated_units(settings)
     return (
         simulation.inertia_kg_m2 + hand.inertia_kg_m2,
         simulation.viscous_nm_s_per_rad + hand.damping_nm_s_per_rad,

@@ -1,4 +1,4 @@
-"""The figures of a sweep, drawn from its Dataset alone (`canwall plot FILE.nc`)."""
+"""Figures of a sweep, drawn from its Dataset alone (`canwall plot FILE.nc`)."""
 
 import itertools
 import math
@@ -18,12 +18,12 @@ from canwall.analysis.analytic_limits import stable_stiffness
 from canwall.errors import InputError
 from canwall.figure_style import COLOURS, STYLE
 from canwall.sweep.axes import DAMPING, STIFFNESS, STRIKES
-from canwall.sweep.labels import LABELS, circumstances, named, panel_title
+from canwall.sweep.labels import LABELS, axis_name, panel_title, shared_parameters
 from canwall.sweep.z_width import draw_z_width
 
-#: Panels of one figure; what else there is goes into figures of its own.
+#: Panels of one figure; further ones go into further figures.
 _PANELS = 6
-#: Lines of one colour are told apart by these.
+#: Lines of one colour differ in these.
 _DASHES = ("-", "--", "-.", ":")
 _MARKS = "osD^v<>P"
 
@@ -31,63 +31,72 @@ Draw = Callable[[Axes, xr.Dataset], None]
 
 
 def write_sweep_figures(dataset: xr.Dataset, stem: Path) -> list[Path]:
-    """Every figure that the axes of a sweep allow, as STEM-NAME.png; their paths.
+    """Draw every figure that the axes of the sweep allow.
 
-    Raises InputError where there is none, or where they cannot be written.
+    Args:
+        dataset: Result of a sweep.
+        stem: Path of the figures without "-NAME.png".
+
+    Returns:
+        Paths of the figures.
+
+    Raises:
+        InputError: If the sweep is a single point or the figures cannot be written.
     """
     written: list[Path] = []
     with mpl.rc_context(STYLE):
         if "worst" in dataset:
             for axis in _lines_over(dataset["worst"]):
                 label = f"limit-over-{axis.replace('.', '-')}"
-                written += _paneled(dataset, stem, label, ("law", axis), _limit_over(axis))
+                written += _draw_panels(dataset, stem, label, ("law", axis), _limit_over(axis))
             if not written:
-                written += _paneled(dataset, stem, "limits", ("law",), _limits_by_law)
+                written += _draw_panels(dataset, stem, "limits", ("law",), _limits_by_law)
         else:
-            stiffness, damping = (named(dataset, pair) for pair in (STIFFNESS, DAMPING))
+            stiffness, damping = (axis_name(dataset, pair) for pair in (STIFFNESS, DAMPING))
             if dataset.sizes[stiffness] > 1:
                 # Over K at the least damping; the map shows the others.
                 least = dataset.isel({damping: 0})
                 over = ("law", stiffness)
-                written += _paneled(least, stem, "energy", over, _energy(stiffness))
-                written += _paneled(least, stem, "amplitude", over, _chatter(stiffness))
-                written += _paneled(least, stem, "frequency", over, _frequency(stiffness))
+                written += _draw_panels(least, stem, "energy", over, _energy(stiffness))
+                written += _draw_panels(least, stem, "amplitude", over, _amplitude(stiffness))
+                written += _draw_panels(least, stem, "frequency", over, _frequency(stiffness))
             if dataset.sizes[damping] > 1 and dataset.sizes[stiffness] > 1:
-                written += _paneled(dataset, stem, "z-width", (damping, stiffness), draw_z_width)
+                over = (damping, stiffness)
+                written += _draw_panels(dataset, stem, "z-width", over, draw_z_width)
     if not written:
-        raise InputError("the sweep has one point alone: there is nothing to draw")
+        raise InputError("the sweep has a single point: there is nothing to draw")
     return written
 
 
 def _lines_over(array: xr.DataArray) -> list[str]:
-    """Axes of numbers that are worth a line: those of three values or more; else any of two."""
+    """Return the numeric axes with three values or more; without any, those with two."""
     numbers = [str(d) for d in array.dims if array[d].dtype.kind in "if" and array.sizes[d] > 1]
     return [d for d in numbers if array.sizes[d] > 2] or numbers
 
 
-def _paneled(
-    dataset: xr.Dataset, stem: Path, name: str, kept: tuple[str, ...], draw: Draw
+def _draw_panels(
+    dataset: xr.Dataset, stem: Path, name: str, drawn: tuple[str, ...], draw: Draw
 ) -> list[Path]:
-    """A panel for each point of the axes that the panels do not have."""
-    others = [str(d) for d in dataset.sizes if d not in kept and d not in STRIKES]
+    """Draw a panel for each point of the axes that are not drawn inside the panels."""
+    others = [str(d) for d in dataset.sizes if d not in drawn and d not in STRIKES]
     points = list(itertools.product(*(range(dataset.sizes[d]) for d in others)))
     paths = []
     for number in range(math.ceil(len(points) / _PANELS)):
-        shown = points[number * _PANELS : (number + 1) * _PANELS]
-        columns = {1: 1, 2: 2, 4: 2}.get(len(shown), 3)
-        rows = math.ceil(len(shown) / columns)
+        of_figure = points[number * _PANELS : (number + 1) * _PANELS]
+        columns = {1: 1, 2: 2, 4: 2}.get(len(of_figure), 3)
+        rows = math.ceil(len(of_figure) / columns)
         figure = Figure(figsize=(4.6 * columns + 1.0, 3.8 * rows), layout="constrained", dpi=120)
-        for place, point in enumerate(shown, start=1):
-            axes = figure.add_subplot(rows, columns, place)
+        for position, point in enumerate(of_figure, start=1):
+            axes = figure.add_subplot(rows, columns, position)
             draw(axes, dataset.isel(dict(zip(others, point, strict=True))))
             axes.set_title(panel_title(dataset, dict(zip(others, point, strict=True))))
-        said = textwrap.fill(circumstances(dataset), 80 * columns)
-        figure.suptitle(said, fontsize=8, color="0.3", x=0.01, ha="left")
+        parameters = textwrap.fill(shared_parameters(dataset), 80 * columns)
+        figure.suptitle(parameters, fontsize=8, color="0.3", x=0.01, ha="left")
         handles, labels = _legend(figure)
         if handles:
             figure.legend(handles, labels, loc="outside lower center", ncols=min(4, 2 * columns))
-        last = f"-{number + 1}" if len(points) > _PANELS else ""
-        path = stem.with_name(f"{stem.name}-{name}{last}.png")
+        suffix = f"-{number + 1}" if len(points) > _PANELS else ""
+        path = stem.with_name(f"{stem.name}-{name}{suffix}.png")
         try:
             figure.savefig(path)
         except OSError as error:
@@ -97,18 +106,18 @@ def _paneled(
 
 
 def _legend(figure: Figure) -> tuple[list[Any], list[str]]:
-    """Each label once, whatever the panel."""
-    found: dict[str, Any] = {}
+    """Collect handles and labels of all panels, each label once."""
+    handles: dict[str, Any] = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            found.setdefault(label, handle)
+            handles.setdefault(label, handle)
         for patch in getattr(axes, "canwall_patches", ()):
-            found.setdefault(patch.get_label(), patch)
-    return list(found.values()), list(found)
+            handles.setdefault(patch.get_label(), patch)
+    return list(handles.values()), list(handles)
 
 
 def _styles(dataset: xr.Dataset) -> list[tuple[str, dict[str, Any]]]:
-    """Law, and how it is drawn: by colour, dashes, and marks where lines meet."""
+    """Return each law with the style of its lines; markers distinguish lines that coincide."""
     return [
         (str(law), {"color": COLOURS[i % 6], "ls": _DASHES[i // 6 % 4], "marker": _MARKS[i % 8]})
         for i, law in enumerate(np.atleast_1d(dataset["law"].values))
@@ -139,37 +148,37 @@ def _limit_over(axis: str) -> Draw:
 
 
 def _linear_limit(dataset: xr.Dataset, axis: str) -> NDArray[np.float64] | None:
-    """K·T²/m up to which the sampled spring and damper are stable; None where it is not known."""
-    found = []
-    for place in range(dataset.sizes[axis]):
-        at = dataset.isel({axis: place})
+    """Return K·T²/m up to which the sampled spring and damper are stable; None for fractional D."""
+    limits = []
+    for i in range(dataset.sizes[axis]):
+        point = dataset.isel({axis: i})
         mass, viscous, period, delay = (
-            at[name].item() for name in ("inertia", "viscous", "period", "loop_delay")
+            point[name].item() for name in ("inertia", "viscous", "period", "loop_delay")
         )
         if delay != int(delay):
             return None
-        name = named(dataset, DAMPING)
-        damping = at[name].item() * (mass / period if name == "damping_normalised" else 1.0)
+        name = axis_name(dataset, DAMPING)
+        damping = point[name].item() * (mass / period if name == "damping_normalised" else 1.0)
         stiffness = stable_stiffness(mass, viscous, damping, period, int(delay))
-        found.append(stiffness * period**2 / mass)
-    return np.array(found)
+        limits.append(stiffness * period**2 / mass)
+    return np.array(limits)
 
 
 def _limits_by_law(axes: Axes, dataset: xr.Dataset) -> None:
-    for place, (law, style) in enumerate(_styles(dataset)):
+    for row, (law, style) in enumerate(_styles(dataset)):
         colour = style["color"]
         one = dataset.sel(law=law)
         scale = one["worst_normalised"].item() / one["worst"].item() if one["worst"] > 0 else 0.0
         strikes = one["limit"].values.ravel() * scale
-        axes.plot(strikes, np.full(strikes.shape, place), ".", color=colour, alpha=0.5)
-        axes.plot(one["worst_normalised"].item(), place, "D", color=colour)
+        axes.plot(strikes, np.full(strikes.shape, row), ".", color=colour, alpha=0.5)
+        axes.plot(one["worst_normalised"].item(), row, "D", color=colour)
     axes.set_yticks(range(dataset.sizes["law"]), [law for law, _ in _styles(dataset)])
     axes.invert_yaxis()
     axes.set_xscale("log")
     axes.set_xlabel("K-limit, K·T²/m (◆ worst, · each strike)")
 
 
-def _over_stiffness(axes: Axes, dataset: xr.Dataset, name: str, label: str) -> None:
+def _label_over_stiffness(axes: Axes, dataset: xr.Dataset, name: str, label: str) -> None:
     axes.set_xscale("log")
     low, high = dataset[name].values[[0, -1]]
     axes.set_xlim(low / 1.05, high * 1.05)
@@ -186,7 +195,7 @@ def _energy(stiffness: str) -> Draw:
             x = one[stiffness].values
             axes.plot(x, worst, label=law, **style | {"marker": ""})
             axes.plot(x[chatters], worst[chatters], "x", color=style["color"], ms=4)
-        # One count times the peak torque: what the encoder cannot tell.
+        # One count times the peak torque: the resolution of the energy.
         tolerance = dataset["energy_tolerance"].max((*STRIKES, "law")).values * 1e6
         axes.plot(
             dataset[stiffness].values,
@@ -197,20 +206,21 @@ def _energy(stiffness: str) -> Draw:
         )
         axes.set_yscale("symlog", linthresh=1.0)
         axes.set_ylim(bottom=-0.1)
-        _over_stiffness(axes, dataset, stiffness, "energy out, worst strike [µJ] (×: chatters)")
+        label = "energy out, worst strike [µJ] (×: chatters)"
+        _label_over_stiffness(axes, dataset, stiffness, label)
 
     return draw
 
 
-def _chatter(stiffness: str) -> Draw:
+def _amplitude(stiffness: str) -> Draw:
     def draw(axes: Axes, dataset: xr.Dataset) -> None:
         for law, style in _styles(dataset):
             worst = dataset["amplitude"].sel(law=law).max(STRIKES).values * 1e3
             axes.plot(dataset[stiffness].values, worst, ms=3, mfc="none", label=law, **style)
         axes.set_yscale("symlog", linthresh=0.01)
-        # None is drawn as zero, and to be seen as that.
+        # No chatter is drawn as zero: keep that line off the axis.
         axes.set_ylim(bottom=-0.001)
-        _over_stiffness(axes, dataset, stiffness, "amplitude of chatter, worst strike [mrad]")
+        _label_over_stiffness(axes, dataset, stiffness, "amplitude of chatter, worst strike [mrad]")
 
     return draw
 
@@ -218,13 +228,13 @@ def _chatter(stiffness: str) -> Draw:
 def _frequency(stiffness: str) -> Draw:
     def draw(axes: Axes, dataset: xr.Dataset) -> None:
         for law, style in _styles(dataset):
-            found = dataset["frequency"].sel(law=law).transpose(stiffness, ...).values
-            found = found.reshape(len(found), -1)
-            x = np.repeat(dataset[stiffness].values, found.shape[1])
-            seen = found.ravel() > 0.0
+            frequency = dataset["frequency"].sel(law=law).transpose(stiffness, ...).values
+            frequency = frequency.reshape(len(frequency), -1)
+            x = np.repeat(dataset[stiffness].values, frequency.shape[1])
+            chatters = frequency.ravel() > 0.0
             points = style | {"ls": "none", "mfc": "none", "ms": 4}
-            axes.plot(x[seen], found.ravel()[seen], label=law, **points)
+            axes.plot(x[chatters], frequency.ravel()[chatters], label=law, **points)
         axes.set_ylim(0.0, max(axes.get_ylim()[1], 10.0))
-        _over_stiffness(axes, dataset, stiffness, "frequency of chatter, each strike [Hz]")
+        _label_over_stiffness(axes, dataset, stiffness, "frequency of chatter, each strike [Hz]")
 
     return draw

@@ -1,4 +1,4 @@
-"""The pieces of work that are done, on disk as they come: what an interruption leaves."""
+"""Journal of a sweep on disk, from which an interrupted one can be resumed."""
 
 import sqlite3
 from pathlib import Path
@@ -10,30 +10,40 @@ from canwall.errors import InputError
 
 
 class Journal:
-    """A file beside the result, with the plan and every piece that is done; gone at the end.
+    """A file next to the result with the plan and the finished pieces, removed at the end.
 
-    A transaction for each piece: however a sweep ends, what was put in is there.
+    Each piece is a transaction: it survives however the process ends.
     """
 
     def __init__(self, output: Path, plan: str, resume: bool) -> None:
-        """plan: what has to be the same for pieces to fit together. Raises InputError."""
+        """Create the journal of the result at `output`, or open it to resume.
+
+        Args:
+            output: Path of the result.
+            plan: Text that identifies the plan; pieces of different plans do not mix.
+            resume: Continue from an existing journal.
+
+        Raises:
+            InputError: If there is a result, a journal that is not to be resumed or of another
+                plan, or if the file cannot be written.
+        """
         if output.exists():
             raise InputError(f"{output}: exists already; choose another --output")
         self.path = output.with_name(output.name + ".partial")
         if self.path.exists() and not resume:
             raise InputError(
-                f"{self.path}: holds an unfinished sweep; --resume goes on with it, or remove it"
+                f"{self.path}: holds an unfinished sweep; --resume continues it, or remove it"
             )
         try:
-            self._base = sqlite3.connect(self.path, timeout=1.0, isolation_level=None)
-            self._base.execute("PRAGMA locking_mode = EXCLUSIVE")
-            self._base.execute("CREATE TABLE IF NOT EXISTS plan (text TEXT)")
-            self._base.execute(
+            self._database = sqlite3.connect(self.path, timeout=1.0, isolation_level=None)
+            self._database.execute("PRAGMA locking_mode = EXCLUSIVE")
+            self._database.execute("CREATE TABLE IF NOT EXISTS plan (text TEXT)")
+            self._database.execute(
                 "CREATE TABLE IF NOT EXISTS pieces (number INTEGER PRIMARY KEY, data BLOB)"
             )
-            known = self._base.execute("SELECT text FROM plan").fetchone()
+            known = self._database.execute("SELECT text FROM plan").fetchone()
             if known is None:
-                self._base.execute("INSERT INTO plan VALUES (?)", (plan,))
+                self._database.execute("INSERT INTO plan VALUES (?)", (plan,))
         except sqlite3.OperationalError as error:
             raise InputError(f"{self.path}: cannot be written: {error}") from None
         except sqlite3.DatabaseError:
@@ -41,37 +51,37 @@ class Journal:
                 f"{self.path}: holds no unfinished sweep; remove it, or choose another --output"
             ) from None
         if known is not None and known[0] != plan:
-            self._base.close()
+            self._database.close()
             raise InputError(
                 f"{self.path}: holds a sweep of another configuration or other axes; "
                 "choose another --output"
             )
 
     def done(self) -> list[int]:
-        """Numbers of the pieces that are there."""
-        return [number for (number,) in self._base.execute("SELECT number FROM pieces")]
+        """Return the numbers of the finished pieces."""
+        return [number for (number,) in self._database.execute("SELECT number FROM pieces")]
 
-    def put(self, number: int, found: NDArray[np.void]) -> None:
-        """Keep a piece. Raises InputError where the disk does not take it."""
+    def put(self, number: int, piece: NDArray[np.void]) -> None:
+        """Store a piece. Raises InputError if it cannot be written."""
         try:
-            self._base.execute(
-                "INSERT OR REPLACE INTO pieces VALUES (?, ?)", (number, found.tobytes())
+            self._database.execute(
+                "INSERT OR REPLACE INTO pieces VALUES (?, ?)", (number, piece.tobytes())
             )
         except sqlite3.Error as error:
             raise InputError(f"{self.path}: cannot be written: {error}") from None
 
     def get(self, number: int, dtype: np.dtype[np.void]) -> NDArray[np.void]:
-        """A piece that is done; shape (n,)."""
-        (data,) = self._base.execute(
+        """Return a finished piece, shape (n,)."""
+        (data,) = self._database.execute(
             "SELECT data FROM pieces WHERE number = ?", (number,)
         ).fetchone()
         return np.frombuffer(data, dtype)
 
     def close(self) -> None:
-        """Leave the file for another time."""
-        self._base.close()
+        """Close the file and keep it."""
+        self._database.close()
 
     def remove(self) -> None:
-        """The result is written: the journal has done its work."""
+        """Close and delete the file."""
         self.close()
         self.path.unlink(missing_ok=True)

@@ -1,86 +1,112 @@
-"""The table of K-limits: every law with every operator, the model matched, or the drive's alone.
+"""Table of K-limits in Markdown: laws by operators, for a matched model and for the drive's alone.
 
-`python -m canwall.sweep.k_limit_table`: Markdown to standard output, progress to standard error.
+Each cell has K [N·m/rad], K·T²/m in bold (at the best B·T/m for a law with a damper), and the
+ratios to the standard wall and to the best damped one.
 """
 
-import sys
+from collections.abc import Callable, Sequence
 
-import numpy as np
 import xarray as xr
-from rich.console import Console
-from rich.progress import Progress
 
-from canwall import config
 from canwall.config import Settings
-from canwall.sweep.dataset import gathered
+from canwall.sweep.dataset import assemble_dataset
 from canwall.sweep.plan import Plan, make_plan
-from canwall.sweep.strike import OPERATORS
-from canwall.sweep.workers import computed
+from canwall.sweep.workers import compute_pieces
 from canwall.walls import LAWS
 
-#: Laws with a damper: they get the damping, B·T/m, at which they are best.
+#: Laws of the table unless others are asked for. A rigid stop has no stiffness to find a limit of.
+TABLE_LAWS = tuple(name for name in LAWS if name != "rigid")
+#: Laws with a damper: the table has them at the damping B·T/m with the largest K-limit.
 DAMPED = ("damped", "thresholded_damper", "unidirectional_damper", "offset_damper")
 DAMPINGS = tuple(round(0.05 * n, 2) for n in range(1, 21))
 MODELS = {"matched": "the model matched", "drive": "a model that knows only the drive"}
 
 
-def limits(base: Settings, laws: list[str], dampings: tuple[float, ...]) -> xr.Dataset:
-    """K-limits of laws with every operator and both models, the best of the dampings."""
-    plan = make_plan(
-        base,
-        {
-            "law": laws,
-            "operator": list(OPERATORS),
-            "model": list(MODELS),
-            "damping_normalised": list(dampings),
-        },
-    )
-    dataset = gathered(plan, _shown(plan, ", ".join(laws[:1]) + " …"))
-    best = dataset["worst_normalised"].argmax("damping_normalised")
-    return dataset[["worst", "worst_normalised", "energy_out", "limit"]].isel(
-        damping_normalised=best
-    )
+def compute_k_limit_table(
+    base: Settings,
+    laws: Sequence[str],
+    operators: Sequence[str],
+    through: str = "sim",
+    workers: int | None = None,
+    dask: str | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> xr.Dataset:
+    """Search the K-limits of the laws, with every operator and both models.
+
+    Args:
+        base: Configuration of the drive; the table has its own axes, `[sweep]` is ignored.
+        laws: Names of the laws; "standard" and "damped" are added, for the ratios.
+        operators: Names of OPERATORS.
+        through: As for `make_plan`.
+        workers: As for `sweep`.
+        dask: As for `sweep`.
+        progress: Called with the pieces of work done and their total.
+
+    Returns:
+        K-limits `worst` [N·m/rad] and `worst_normalised` (K·T²/m) over law, operator and model,
+        with the coordinate `damping_normalised` (B·T/m) at which they are reached.
+
+    Raises:
+        InputError: For a law or an operator that does not exist.
+    """
+    base = base.model_copy(update={"sweep": {}})
+    chosen = dict.fromkeys(["standard", "damped", *laws])
+    undamped = [law for law in chosen if law not in DAMPED]
+    damped = [law for law in chosen if law in DAMPED]
+    plans = [
+        _make_plan(base, undamped, operators, (0.0,), through),
+        _make_plan(base, damped, operators, DAMPINGS, through),
+    ]
+    done, total = 0, sum(plan.pieces for plan in plans)
+    tables = []
+    for plan in plans:
+        pieces = {}
+        progress(done, total)
+        for number, piece in compute_pieces(plan, range(plan.pieces), workers, dask):
+            pieces[number] = piece
+            done += 1
+            progress(done, total)
+        dataset = assemble_dataset(plan, pieces)[["worst", "worst_normalised"]]
+        best = dataset["worst_normalised"].argmax("damping_normalised")
+        tables.append(dataset.isel(damping_normalised=best))
+    return xr.concat(tables, "law", join="outer")
 
 
-def _shown(plan: Plan, what: str) -> dict[int, np.ndarray[tuple[int, ...], np.dtype[np.void]]]:
-    with Progress(console=Console(stderr=True)) as progress:
-        return dict(
-            progress.track(computed(plan, range(plan.pieces)), total=plan.pieces, description=what)
-        )
+def _make_plan(
+    base: Settings,
+    laws: Sequence[str],
+    operators: Sequence[str],
+    dampings: Sequence[float],
+    through: str,
+) -> Plan:
+    axes = {
+        "law": list(laws),
+        "operator": list(operators),
+        "model": list(MODELS),
+        "damping_normalised": list(dampings),
+    }
+    return make_plan(base, axes, through)
 
 
-def main() -> None:
-    """Compute and print; arguments: names of laws (default: all that have a stiffness)."""
-    base = config.load(config.shipped("config/sim.toml"))
-    names = sys.argv[1:] or [name for name in LAWS if name != "rigid"]
-    plain = [n for n in dict.fromkeys(["standard", *names]) if n not in DAMPED]
-    damped = [n for n in dict.fromkeys(["damped", *names]) if n in DAMPED]
-    found = xr.concat(
-        [limits(base, plain, (0.0,)), limits(base, damped, DAMPINGS)], "law", join="outer"
-    )
-    for model, described in MODELS.items():
-        print(f"\nWith {described}:\n")
-        print("| law | " + " | ".join(OPERATORS) + " |")
-        print("|---|" + "---|" * len(OPERATORS))
-        for name in names:
-            cells = (_cell(found.sel(model=model, operator=o), name) for o in OPERATORS)
-            print(f"| {name} | " + " | ".join(cells) + " |")
+def format_k_limit_table(table: xr.Dataset, laws: Sequence[str]) -> str:
+    """Format the result of `compute_k_limit_table` as Markdown, with a row for each of the laws."""
+    operators = [str(name) for name in table["operator"].values]
+    lines = []
+    for model, description in MODELS.items():
+        lines += ["", f"With {description}:", ""]
+        lines += ["| law | " + " | ".join(operators) + " |", "|---|" + "---|" * len(operators)]
+        for law in laws:
+            cells = (_format_cell(table.sel(model=model, operator=o), law) for o in operators)
+            lines.append(f"| {law} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
 
 
-def _cell(found: xr.Dataset, law: str) -> str:
-    """K; K·T²/m (B·T/m where there is a damper); ratios to standard and to damped."""
-    worst = found["worst"].sel(law=law).item()
-    tuned = ""
+def _format_cell(limits: xr.Dataset, law: str) -> str:
+    worst = limits["worst"].sel(law=law).item()
+    normalised = limits["worst_normalised"].sel(law=law).item()
+    damping = ""
     if law in DAMPED:
-        tuned = f" at {found['damping_normalised'].sel(law=law).item():g}"
-    normalised = found["worst_normalised"].sel(law=law).item()
-    ratios = (_ratio(worst, found["worst"].sel(law=o).item()) for o in ("standard", "damped"))
-    return f"{worst:.3g}; **{normalised:.3g}**{tuned}; {'; '.join(ratios)}"
-
-
-def _ratio(one: float, other: float) -> str:
-    return f"{one / other:.3g}×" if other > 0.0 else "—"
-
-
-if __name__ == "__main__":
-    main()
+        damping = f" at {limits['damping_normalised'].sel(law=law).item():g}"
+    references = (limits["worst"].sel(law=name).item() for name in ("standard", "damped"))
+    ratios = (f"{worst / other:.3g}×" if other > 0.0 else "—" for other in references)
+    return f"{worst:.3g}; **{normalised:.3g}**{damping}; {'; '.join(ratios)}"

@@ -1,4 +1,4 @@
-"""What the figures of a sweep say in words: axes, titles, circumstances."""
+"""Text in the figures of a sweep: labels of axes, titles of panels, shared parameters."""
 
 import math
 
@@ -7,7 +7,7 @@ import xarray as xr
 
 from canwall.sweep.axes import STRIKES
 
-#: An axis of a sweep as the label of a figure's.
+#: Axis labels.
 LABELS = {
     "stiffness": "K [N·m/rad]",
     "stiffness_normalised": "K·T²/m",
@@ -19,7 +19,7 @@ LABELS = {
     "counts": "encoder [counts per turn]",
     "torque_step": "torque step [N·m]",
 }
-#: An axis in the title of a panel.
+#: Values of an axis in the title of a panel.
 _TITLES = {
     "stiffness": "K = {} N·m/rad",
     "stiffness_normalised": "K·T²/m = {}",
@@ -32,25 +32,28 @@ _TITLES = {
 }
 
 
-def named(dataset: xr.Dataset, names: tuple[str, ...]) -> str:
-    """Which of the names the dataset has."""
+def axis_name(dataset: xr.Dataset, names: tuple[str, ...]) -> str:
+    """Return the one of these names that the dataset has as an axis."""
     return next(name for name in names if name in dataset.coords)
 
 
 def panel_title(dataset: xr.Dataset, point: dict[str, int]) -> str:
-    """What tells a panel from the others; point: the place on each of its axes."""
+    """Return the title of a panel: the values in which it differs from the others.
+
+    point: index of the panel on each of the axes.
+    """
     parts = []
-    for name, place in point.items():
+    for name, index in point.items():
         if dataset.sizes[name] > 1 or name in ("law", "operator"):
-            said = _TITLES.get(name, "{}" if name == "law" else f"{name} = {{}}")
-            value = dataset[name].values[place]
-            parts.append(said.format(value if isinstance(value, str) else f"{value:g}"))
+            title = _TITLES.get(name, "{}" if name == "law" else f"{name} = {{}}")
+            value = dataset[name].values[index]
+            parts.append(title.format(value if isinstance(value, str) else f"{value:g}"))
     return ", ".join(parts)
 
 
-def circumstances(dataset: xr.Dataset) -> str:
-    """What is the same for all panels, for whoever sees the picture alone."""
-    said = (
+def shared_parameters(dataset: xr.Dataset) -> str:
+    """Return a line with the parameters that all panels share."""
+    formats = (
         ("period", "T = {:g} ms", 1e3),
         ("loop_delay", "D = {:g}", 1.0),
         ("inertia", "m = {:.3g} kg·m²", 1.0),
@@ -60,7 +63,7 @@ def circumstances(dataset: xr.Dataset) -> str:
         ("force_step", "torque step {:.3g} mN·m", 1e3),
     )
     parts = []
-    for name, text, scale in said:
+    for name, text, scale in formats:
         values = np.unique(dataset[name].values)
         if len(values) == 1:
             parts.append(text.format(values[0] * scale))

@@ -1,4 +1,4 @@
-"""What a sweep is to do, cut into pieces of work that depend on nothing but their number."""
+"""Plan of a sweep, divided into pieces of work that each depend on their number alone."""
 
 import itertools
 import math
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from canwall.analysis.k_limit import LIMITED, k_limits
+from canwall.analysis.k_limit import K_LIMIT, k_limits
 from canwall.analysis.strike import MEASURES
 from canwall.config import Settings
 from canwall.cycle import named_law
@@ -22,14 +22,14 @@ from canwall.sweep.axes import (
     STRIKES,
     SweepAxis,
     Value,
-    parsed,
+    parse_axis,
     resolve,
 )
 from canwall.sweep.strike import PreparedStrike
 
-#: A piece of work and what was found, as `compute` returns it.
-Found = tuple[int, NDArray[np.void]]
-#: Points of a map that are one piece of work: its strike is prepared once.
+#: Number of a piece of work, and its result as `compute_piece` returns it.
+PieceResult = tuple[int, NDArray[np.void]]
+#: Walls of a map in one piece of work, for which the strike is prepared once.
 _PIECE = 120
 #: The largest result: 1.5 GB.
 _MOST_POINTS = 10_000_000
@@ -37,9 +37,16 @@ _MOST_POINTS = 10_000_000
 
 @dataclass(frozen=True)
 class Plan:
-    """A sweep: the configuration, its axes, and whether frames carry it ("bus") or not ("sim").
+    """A sweep: the configuration and its axes.
 
-    conditions: all axes but the others here. Without a stiffness axis the K-limits are searched.
+    Attributes:
+        base: Configuration that the axes change.
+        conditions: Axes other than those below, the law first.
+        stiffness: Stiffness axis of a map; None: the K-limits are searched.
+        damping: Damping axis.
+        speed: Approach speeds of the hand.
+        phase: Phases of the contact relative to the SYNC.
+        through: "sim": strikes in memory; "bus": by frames.
     """
 
     base: Settings
@@ -52,35 +59,35 @@ class Plan:
 
     @property
     def axes(self) -> list[SweepAxis]:
-        """All of them, in the order of the result's dimensions."""
+        """All axes, in the order of the result's dimensions."""
         wall = [self.damping] if self.stiffness is None else [self.damping, self.stiffness]
         return [*self.conditions, *wall, self.speed, self.phase]
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """How many values each axis has."""
+        """Shape of the result: the number of values on each axis."""
         return tuple(len(axis.values) for axis in self.axes)
 
     @property
-    def points_in_all(self) -> int:
-        """Of the result: strikes, each with its wall."""
+    def point_count(self) -> int:
+        """Number of points of the result: strikes, each with its wall."""
         return math.prod(self.shape)
 
     @property
     def dtype(self) -> np.dtype[np.void]:
-        """Of the result: MEASURES of a map, LIMITED of a search."""
-        return MEASURES if self.stiffness is not None else LIMITED
+        """Dtype of the result: MEASURES for a map, K_LIMIT for a search."""
+        return MEASURES if self.stiffness is not None else K_LIMIT
 
     @cached_property
     def points(self) -> list[dict[str, Value]]:
-        """The conditions, in order."""
+        """Points of the condition axes, in order."""
         names = [axis.name for axis in self.conditions]
         values = (axis.values for axis in self.conditions)
         return [dict(zip(names, chosen, strict=True)) for chosen in itertools.product(*values)]
 
     @property
     def strikes(self) -> list[dict[str, Value]]:
-        """Approach speeds and phases, in order."""
+        """Points of the strike axes, speed and phase, in order."""
         chosen = itertools.product(self.speed.values, self.phase.values)
         return [{"speed": speed, "phase": phase} for speed, phase in chosen]
 
@@ -96,13 +103,13 @@ class Plan:
 
     @property
     def pieces(self) -> int:
-        """How many pieces of work there are."""
+        """Number of pieces of work."""
         if self.stiffness is None:
             return len(self.points) * len(self.damping.values)
         return len(self.points) * len(self.strikes) * self._per_strike
 
     def where(self, piece: int) -> tuple[int, slice, slice]:
-        """What a piece computes: condition, strikes, walls (dampings in a search)."""
+        """Return what a piece computes: condition, strikes, and walls (dampings in a search)."""
         if self.stiffness is None:
             condition, damping = divmod(piece, len(self.damping.values))
             return condition, slice(0, len(self.strikes)), slice(damping, damping + 1)
@@ -112,21 +119,28 @@ class Plan:
         return condition, slice(strike, strike + 1), walls
 
     def settings(self, point: Mapping[str, Value], strike: Mapping[str, Value]) -> Settings:
-        """Those of one strike. Raises ConfigError."""
+        """Return the settings of one strike. Raises ConfigError."""
         return resolve(self.base, {**point, **strike})
 
 
 def make_plan(base: Settings, given: Mapping[str, object], through: str = "sim") -> Plan:
-    """A plan from the axes of a configuration and those `given`, which go first.
+    """Make a plan from the axes in `[sweep]` and those given, which take precedence.
 
-    Raises InputError and ConfigError for an axis that is not there, or has a value that cannot be.
+    Args:
+        base: Configuration with `[simulation]`.
+        given: Values of axes by name, as `parse_axis` takes them.
+        through: "sim": strikes in memory; "bus": by frames.
+
+    Raises:
+        InputError: For an axis that does not exist or has an impossible value.
+        ConfigError: Likewise, for a key of the configuration.
     """
     if base.simulation is None:
         raise InputError("[simulation] is missing: there is no drive to simulate")
     if through not in ("sim", "bus"):
         raise InputError(f"--through {through}: has to be sim or bus")
-    axes = {name: parsed(name, v) for name, v in {**base.sweep, **given}.items()}
-    # One of the two ways to say a stiffness or a damping; what is given goes before the file.
+    axes = {name: parse_axis(name, v) for name, v in {**base.sweep, **given}.items()}
+    # A stiffness or a damping has two forms; one that is given replaces either in the file.
     for pair in (STIFFNESS, DAMPING):
         both = [name for name in pair if name in axes]
         if len(both) == 2 and all(name in given for name in both):
@@ -135,29 +149,29 @@ def make_plan(base: Settings, given: Mapping[str, object], through: str = "sim")
             axes = {n: a for n, a in axes.items() if n not in both or n in given}
     for key in ("wall.stiffness_nm_per_rad", "wall.damping_nm_s_per_rad", "wall.law"):
         if key in axes:
-            raise InputError(f"sweep axis {key}: is called {key[5:].split('_')[0]} here")
+            raise InputError(f"sweep axis {key}: use {key[5:].split('_')[0]} instead")
     defaults: dict[str, Any] = {"law": (named_law(base),)}
     defaults |= {name: DEFAULTS[name] for name in STRIKES}
     if not any(name in axes for name in DAMPING):
         defaults["damping"] = (base.wall.damping_nm_s_per_rad,)
     axes = {n: SweepAxis(n, tuple(v)) for n, v in defaults.items() if n not in axes} | axes
 
-    def taken(names: Sequence[str]) -> SweepAxis | None:
+    def pop(names: Sequence[str]) -> SweepAxis | None:
         return next((axes.pop(name) for name in names if name in axes), None)
 
-    stiffness, damping = taken(STIFFNESS), taken(DAMPING)
+    stiffness, damping = pop(STIFFNESS), pop(DAMPING)
     speed, phase = axes.pop("speed"), axes.pop("phase")
     assert damping is not None
     law = axes.pop("law")
     plan = Plan(base, (law, *axes.values()), stiffness, damping, speed, phase, through)
-    if plan.points_in_all > _MOST_POINTS:
-        raise InputError(f"sweep axes: {plan.points_in_all} points; {_MOST_POINTS} at most")
-    _try_out(plan)
+    if plan.point_count > _MOST_POINTS:
+        raise InputError(f"sweep axes: {plan.point_count} points; {_MOST_POINTS} at most")
+    _check_values(plan)
     return plan
 
 
-def _try_out(plan: Plan) -> None:
-    """Prepare a strike for each value of each axis, the others at their first."""
+def _check_values(plan: Plan) -> None:
+    """Prepare a strike for each value of each axis, with the first value of the others."""
     first, strike = plan.points[0], plan.strikes[0]
     PreparedStrike(plan.settings(first, strike))
     for axis in plan.conditions:
@@ -167,8 +181,8 @@ def _try_out(plan: Plan) -> None:
         plan.settings(first, other)
 
 
-def compute(plan: Plan, piece: int) -> NDArray[np.void]:
-    """One piece of work; shape (strikes, walls), dtype of the plan."""
+def compute_piece(plan: Plan, piece: int) -> NDArray[np.void]:
+    """Compute a piece of work; shape (strikes, walls), dtype of the plan."""
     condition, strikes, walls = plan.where(piece)
     point = plan.points[condition]
     prepared = [

@@ -1,4 +1,4 @@
-"""One strike of an operator on a wall: as settings of a run, rendered, and measured."""
+"""One strike of an operator on a wall: as settings of a run, rendered, and judged."""
 
 import threading
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.analysis import ReferentInputs, follow_referent
-from canwall.analysis.strike import MEASURES, measure
+from canwall.analysis.strike import MEASURES, measure_strike
 from canwall.compiled import Record, compiled
 from canwall.config import ConfigError, Hand, Mechanics, Settings
 from canwall.cycle import run_laws
@@ -21,7 +21,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Operator:
-    """Who is at the handle: impedance in shaft coordinates."""
+    """Impedance of an operator at the handle, in shaft coordinates.
+
+    Attributes:
+        name: Name on the axis `operator`.
+        inertia_kg_m2: Inertia [kg·m²].
+        damping_nm_s_per_rad: Damping [N·m·s/rad].
+        stiffness_nm_per_rad: Stiffness [N·m/rad].
+    """
 
     name: str
     inertia_kg_m2: float
@@ -30,7 +37,7 @@ class Operator:
 
     @property
     def keys(self) -> dict[str, float]:
-        """As keys of a configuration."""
+        """Values of the keys of a configuration."""
         return {
             f"simulation.hand.{key}": value for key, value in vars(self).items() if key != "name"
         }
@@ -40,13 +47,13 @@ _RADIUS_M = 0.08
 
 
 def _at_radius(name: str, mass_kg: float, damping: float, stiffness: float) -> Operator:
-    """Mass [kg], damping [N·s/m] and stiffness [N/m] at a handle of 80 mm."""
+    """Convert mass [kg], damping [N·s/m] and stiffness [N/m] at a handle of 80 mm."""
     square = _RADIUS_M**2
     return Operator(name, mass_kg * square, damping * square, stiffness * square)
 
 
-#: Operators within the ranges of theory.md, section 7. A grip is a hand that holds the handle
-#: with its fingers: 50 g, as stiff and damped as a stiff finger.
+#: Operators within the ranges of theory, section 7. In a grip the fingers hold the handle: 50 g,
+#: as stiff and damped as a stiff finger.
 OPERATORS = {
     operator.name: operator
     for operator in (
@@ -60,17 +67,22 @@ OPERATORS = {
 _PRESSING_NM = 0.15
 _FIRST_STRIKE_S = 0.05
 _AFTERWARDS_S = 0.25
-#: Cycles of rest between enabling and the strike: at 100 Hz the above is no time for it.
+#: Cycles of rest between enabling and the strike: at 100 Hz _FIRST_STRIKE_S is too short for it.
 _AT_REST_CYCLES = 3
-#: The longest strike: 100 MB of signals.
+#: Longest strike: 100 MB of signals.
 _MOST_CYCLES = 2_000_000
 
 
-def model_of(settings: Settings, knows: str, error: float) -> Mechanics:
-    """The laws' model: "matched" knows drive and hand, "drive" the drive alone, "file" [mechanics].
+def law_model(settings: Settings, knows: str, error: float) -> Mechanics:
+    """Return the model that the laws use.
 
-    error is the relative error of its inertia. The hand's spring is not in it: it is about a hand
-    that moves, and left to the estimated force.
+    The hand's spring is never part of it: its rest position moves, so it is left to the estimated
+    force.
+
+    Args:
+        settings: Configuration with `[simulation]`.
+        knows: "matched": drive and hand; "drive": the drive alone; "file": `[mechanics]`.
+        error: Relative error of the inertia.
     """
     simulation = settings.simulation
     assert simulation is not None
@@ -93,11 +105,18 @@ def model_of(settings: Settings, knows: str, error: float) -> Mechanics:
 def strike_settings(
     settings: Settings, speed_rad_s: float, phase: float, start_rad: float, press_s: float
 ) -> Settings:
-    """The configuration's operator strikes the wall once, pressing with 0.15 N·m for press_s.
+    """Return settings with which the operator strikes the wall once and presses with 0.15 N·m.
 
-    speed_rad_s is the mean speed of the hand's approach from start_rad off the wall; phase,
-    0 … 1, shifts the start by that share of the way of one period, and with it the instant of
-    contact against the SYNC. Raises ConfigError for a strike that lasts too many cycles.
+    Args:
+        settings: Configuration with `[simulation]`; its hand is the operator.
+        speed_rad_s: Mean speed of the hand's approach [rad/s].
+        phase: Phase of the contact relative to the SYNC, 0 … 1: shifts the start by this share of
+            the way of one period.
+        start_rad: Distance from the wall at which the approach starts [rad].
+        press_s: Time for which the hand presses [s].
+
+    Raises:
+        ConfigError: If the strike has too many cycles.
     """
     simulation, period = settings.simulation, settings.bus.cycle_s
     assert simulation is not None
@@ -105,7 +124,7 @@ def strike_settings(
     wall = settings.wall.position_rad
     start = start_rad + phase * speed_rad_s * period
     stiffness = simulation.hand.stiffness_nm_per_rad
-    # A hand with a spring presses by it; without one, by its muscle torque alone.
+    # A hand with a spring presses through it, one without by its muscle torque alone.
     depth = _PRESSING_NM / stiffness if stiffness > 0.0 else 0.0
     travel_s = (start + depth) / speed_rad_s
     first_s = max(_FIRST_STRIKE_S, (ENABLING_CYCLES + _AT_REST_CYCLES) * period)
@@ -139,10 +158,10 @@ def strike_settings(
 
 
 class PreparedStrike:
-    """One strike, prepared, to be rendered against one wall after another, and measured."""
+    """One strike, prepared once, to be rendered on one wall after another and judged."""
 
     def __init__(self, settings: Settings, through: str = "sim") -> None:
-        """settings: of `strike_settings`. through: "sim", in memory, or "bus", by frames."""
+        """Prepare the strike of `strike_settings`, in memory ("sim") or by frames ("bus")."""
         assert settings.run.duration_s is not None
         assert settings.simulation is not None
         self._settings = settings
@@ -154,33 +173,40 @@ class PreparedStrike:
 
     @property
     def mass(self) -> float:
-        """Inertia of what really moves [kg·m²]."""
+        """Inertia of drive, handle and hand together [kg·m²]."""
         assert self._settings.simulation is not None
         simulation = self._settings.simulation
         return simulation.inertia_kg_m2 + simulation.hand.inertia_kg_m2
 
     @property
     def period(self) -> float:
-        """T [s]."""
+        """Period T of the SYNC [s]."""
         return self._settings.bus.cycle_s
 
     def on(self, stiffness: float, damping: float) -> np.void:
-        """The strike on a wall of that stiffness [N·m/rad] and damping [N·m·s/rad]; MEASURES."""
+        """Strike a wall of this stiffness [N·m/rad] and damping [N·m·s/rad]; dtype MEASURES."""
         return self.on_all(np.array([[stiffness, damping]]))[0]
 
     def on_all(self, walls: Array) -> NDArray[np.void]:
-        """`on` for walls of shape (n, 2), stiffness and damping; shape (n,), dtype MEASURES."""
-        found = np.zeros(len(walls), MEASURES)
+        """Strike several walls.
+
+        Args:
+            walls: Stiffness [N·m/rad] and damping [N·m·s/rad] of each wall, shape (n, 2).
+
+        Returns:
+            Measures of each strike, shape (n,), dtype MEASURES.
+        """
+        measures = np.zeros(len(walls), MEASURES)
         if self._by_frames:
             for i, (stiffness, damping) in enumerate(walls.tolist()):
-                found[i] = self._through_frames(stiffness, damping)
+                measures[i] = self._strike_over_bus(stiffness, damping)
         else:
-            # One call for all of them: between two, the threads of a sweep would wait in turns for
-            # the interpreter's lock.
-            _strike_all(self._loop, self._referent, walls, np.zeros(1, ROW), found)
-        return found
+            # One call for all walls: between calls, the threads of a sweep would contend for the
+            # interpreter's lock.
+            _strike_all(self._loop, self._referent, walls, np.zeros(1, ROW), measures)
+        return measures
 
-    def _through_frames(self, stiffness: float, damping: float) -> np.void:
+    def _strike_over_bus(self, stiffness: float, damping: float) -> np.void:
         wall = {"stiffness_nm_per_rad": stiffness, "damping_nm_s_per_rad": damping}
         signals, trip = signals_over_bus(
             self._settings.model_copy(update={"wall": self._settings.wall.model_copy(update=wall)})
@@ -188,9 +214,9 @@ class PreparedStrike:
         referent = np.empty(self._cycles)
         each = np.full(self._cycles, stiffness), np.full(self._cycles, damping)
         follow_referent(self._referent, *each, referent)
-        found = np.zeros(1, MEASURES)
-        _judge(self._loop, signals, trip, referent, stiffness, found)
-        return found[0]
+        measures = np.zeros(1, MEASURES)
+        _judge(self._loop, signals, trip, referent, stiffness, measures)
+        return measures[0]
 
 
 @compiled
@@ -199,9 +225,9 @@ def _strike_all(
     hand: ReferentInputs,
     walls: Array,
     rows: NDArray[np.void],
-    found: NDArray[np.void],
+    measures: NDArray[np.void],
 ) -> None:
-    """Strike and judge every wall; rows has dtype ROW, and is scratch."""
+    """Strike and judge every wall; rows, shape (1,) and dtype ROW, is scratch memory."""
     cycles = len(loop.push)
     signals = np.empty((3, cycles))
     stiffness, damping, referent = np.empty(cycles), np.empty(cycles), np.empty(cycles)
@@ -211,7 +237,7 @@ def _strike_all(
         cycle: Record = loop.cycle[0]
         follow_referent(hand, stiffness, damping, referent)
         rendered = signals[:, loop.enabling : done]
-        _judge(loop, rendered, cycle.trip, referent, walls[i, 0], found[i : i + 1])
+        _judge(loop, rendered, cycle.trip, referent, walls[i, 0], measures[i : i + 1])
 
 
 @compiled
@@ -221,30 +247,33 @@ def _judge(
     trip: int,
     referent: Array,
     stiffness: float,
-    found: NDArray[np.void],
+    measures: NDArray[np.void],
 ) -> None:
-    """Into found, (1,); signals, (3, n): of `simulate_loop`, from the end of enabling on."""
+    """Judge one strike into measures, shape (1,).
+
+    signals, shape (3, n), are those of `simulate_loop` from the end of enabling on.
+    """
     cycle: Record = loop.cycle[0]
-    measure(
+    measure_strike(
         signals[0],
         signals[1],
         signals[2],
         trip,
-        trip != 0 and not _leaves(cycle, referent),
+        trip != 0 and not _exceeds_limits(cycle, referent),
         referent[loop.enabling : loop.enabling + signals.shape[1]],
         cycle.period,
         cycle.rad_per_count,
         cycle.nm_per_mille,
         stiffness,
-        found,
+        measures,
     )
 
 
 @compiled
-def _leaves(cycle: Record, referent: Array) -> bool:
-    """Whether the referent itself passes the limits that end a run.
+def _exceeds_limits(cycle: Record, referent: Array) -> bool:
+    """Return whether the referent itself exceeds the limits of position or speed.
 
-    A soft wall gives way that far, and a stiff one gives back what was put into it.
+    A soft wall may give way that far, and a stiff one return that much of the energy put into it.
     """
     for j in range(len(referent)):
         position = cycle.rendered[0].position + cycle.orientation * referent[j]
@@ -256,11 +285,12 @@ def _leaves(cycle: Record, referent: Array) -> bool:
 
 
 def signals_over_bus(settings: Settings) -> tuple[Array, int]:
-    """Render the wall of a strike through frames, on an embedded bus of its own.
+    """Render the wall of a strike by frames, on an embedded bus.
 
-    Signals as those of `simulate_loop`, shape (3, n), from the end of enabling on; and the trip.
+    Returns:
+        The signals of `simulate_loop` from the end of enabling on, shape (3, n), and the trip.
     """
-    # A bus of its own: other threads of the process may strike at the same time.
+    # Each thread has a bus: others may strike at the same time.
     channel = f"{settings.bus.channel}-{threading.get_ident()}"
     bus = settings.bus.model_copy(update={"interface": "virtual", "channel": channel})
     settings = settings.model_copy(update={"bus": bus})

@@ -1,4 +1,4 @@
-"""What a sweep came to, as a table for people."""
+"""Result of a sweep as a table on the terminal."""
 
 import itertools
 import math
@@ -9,17 +9,17 @@ from rich.markup import escape
 from rich.table import Table
 
 from canwall.sweep.axes import DAMPING, STIFFNESS, STRIKES
-from canwall.sweep.labels import named
+from canwall.sweep.labels import axis_name
 
 
 def sweep_table(dataset: xr.Dataset) -> Table:
-    """A row for each condition: its K-limit, or what of its map is free of chatter."""
+    """Return a table with a row per condition: its K-limit, or the free part of its map."""
     strikes = math.prod(dataset.sizes[name] for name in STRIKES)
     title = "K-limits" if "worst" in dataset else "Free of chatter"
-    found = _limits(dataset) if "worst" in dataset else _maps(dataset)
+    rows = _limit_rows(dataset) if "worst" in dataset else _map_rows(dataset)
     table = Table(title=f"{title} (the worst of {strikes})", title_justify="left")
-    for place, row in enumerate(found):
-        if place == 0:
+    for number, row in enumerate(rows):
+        if number == 0:
             for name in row:
                 table.add_column(
                     escape(name), justify="left" if name == "law" else "right", no_wrap=True
@@ -28,12 +28,12 @@ def sweep_table(dataset: xr.Dataset) -> Table:
     return table
 
 
-def without_effect(dataset: xr.Dataset) -> list[str]:
-    """A line for stiffness or damping where the walls of some laws are the same at all its values.
+def ineffective_axis_notes(dataset: xr.Dataset) -> list[str]:
+    """Return a line for each axis of the wall that changes nothing for some of the laws.
 
-    A law without a damper takes any damping, and one without a spring any stiffness.
+    A law without a damper ignores the damping, one without a spring the stiffness.
     """
-    lines = []
+    notes = []
     for axis in (*STIFFNESS, *DAMPING):
         if dataset.sizes.get(axis, 1) > 1:
             rendered = dataset[["peak_torque", "penetration", "energy_out"]]
@@ -42,49 +42,51 @@ def without_effect(dataset: xr.Dataset) -> list[str]:
             without = same.all([dim for dim in same.dims if dim != "law"])
             laws = [str(law) for law in without["law"].values[without.values]]
             if laws:
-                lines.append(f"{axis} changes nothing for {', '.join(laws)}")
-    return lines
+                notes.append(f"{axis} changes nothing for {', '.join(laws)}")
+    return notes
 
 
-def _limits(dataset: xr.Dataset) -> Iterator[dict[str, str]]:
+def _limit_rows(dataset: xr.Dataset) -> Iterator[dict[str, str]]:
     worst = dataset["worst"]
-    for shown, at in _conditions(dataset, [str(d) for d in worst.dims]):
-        limit = worst.isel(at).item()
-        best = dataset["limit"].isel(at).max().item()
-        # Where no strike chatters the search ends, not the wall.
-        least = "≥ " if dataset["open_ended"].isel(at).all().item() else ""
-        yield shown | {
-            "K\n[N·m/rad]": least + f"{limit:.3g}",
-            "K·T²/m": least + f"{dataset['worst_normalised'].isel(at).item():.3g}",
+    for labels, index in _conditions(dataset, [str(d) for d in worst.dims]):
+        limit = worst.isel(index).item()
+        best = dataset["limit"].isel(index).max().item()
+        # If no strike chatters, the limit is where the search ended.
+        at_least = "≥ " if dataset["open_ended"].isel(index).all().item() else ""
+        normalised = dataset["worst_normalised"].isel(index).item()
+        yield labels | {
+            "K\n[N·m/rad]": at_least + f"{limit:.3g}",
+            "K·T²/m": at_least + f"{normalised:.3g}",
             "best strike\n÷ worst": f"{best / limit:.3g}" if limit > 0.0 else "–",
         }
 
 
-def _maps(dataset: xr.Dataset) -> Iterator[dict[str, str]]:
-    wall = [named(dataset, DAMPING), named(dataset, STIFFNESS)]
+def _map_rows(dataset: xr.Dataset) -> Iterator[dict[str, str]]:
+    wall = [axis_name(dataset, DAMPING), axis_name(dataset, STIFFNESS)]
     chatters = dataset["chatters"].any(STRIKES).transpose(..., *wall)
-    for shown, at in _conditions(dataset, [str(d) for d in chatters.dims if d not in wall]):
-        one = chatters.isel(at).values
+    for labels, index in _conditions(dataset, [str(d) for d in chatters.dims if d not in wall]):
+        map_chatters = chatters.isel(index).values
         stiffness = dataset[wall[1]].values
-        # Up to the first wall that chatters, at the damping where that is farthest.
-        free = max(next((i for i, c in enumerate(row) if c), len(row)) for row in one)
-        yield shown | {
-            "walls": str(one.size),
-            "free": str(int((~one).sum())),
+        # Up to the first wall that chatters, at the damping with the most walls before it.
+        free = max(next((i for i, c in enumerate(row) if c), len(row)) for row in map_chatters)
+        energy_out = dataset["energy_out"].isel(index).max().item()
+        yield labels | {
+            "walls": str(map_chatters.size),
+            "free": str(int((~map_chatters).sum())),
             f"free up to\n{wall[1]}": f"{stiffness[free - 1]:.3g}" if free else "none",
-            "energy out\n[mJ], at most": f"{dataset['energy_out'].isel(at).max().item() * 1e3:.3g}",
+            "energy out\n[mJ], at most": f"{energy_out * 1e3:.3g}",
         }
 
 
 def _conditions(
     dataset: xr.Dataset, dims: Sequence[str]
 ) -> Iterator[tuple[dict[str, str], dict[str, int]]]:
-    """What tells each condition from the others, and its place on each axis."""
+    """Yield the labels that identify each condition, and its index on each axis."""
     for point in itertools.product(*(range(dataset.sizes[d]) for d in dims)):
-        at = dict(zip(dims, point, strict=True))
-        shown = {}
-        for name, place in at.items():
+        index = dict(zip(dims, point, strict=True))
+        labels = {}
+        for name, i in index.items():
             if dataset.sizes[name] > 1 or name == "law":
-                value = dataset[name].values[place]
-                shown[name] = value if isinstance(value, str) else f"{value:g}"
-        yield shown, at
+                value = dataset[name].values[i]
+                labels[name] = value if isinstance(value, str) else f"{value:g}"
+        yield labels, index

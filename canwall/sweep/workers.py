@@ -1,4 +1,4 @@
-"""Who computes the pieces of a sweep: this machine's cores, or a cluster."""
+"""Computation of the pieces of a sweep, on this machine's cores or on a cluster."""
 
 import multiprocessing
 import os
@@ -8,46 +8,52 @@ from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 
 from threadpoolctl import threadpool_limits
 
-from canwall.sweep.cluster import on_a_cluster
-from canwall.sweep.plan import Found, Plan, compute
+from canwall.sweep.cluster import compute_on_cluster
+from canwall.sweep.plan import PieceResult, Plan, compute_piece
 
 
-def computed(
+def compute_pieces(
     plan: Plan, pieces: Sequence[int], workers: int | None = None, dask: str | None = None
-) -> Iterator[Found]:
-    """The pieces with their numbers, as they are done; ended early, it leaves nothing running.
+) -> Iterator[PieceResult]:
+    """Yield the pieces with their numbers as they are done; closing it stops the work.
 
-    workers: how many cores (None: all). dask: address of a scheduler instead. Raises InputError
-    where no scheduler is.
+    Args:
+        plan: Plan of the sweep.
+        pieces: Numbers of the pieces to compute.
+        workers: Number of cores; None: all.
+        dask: Address of a Dask scheduler, instead of this machine's cores.
+
+    Raises:
+        InputError: If there is no scheduler at the address.
     """
     if dask is not None:
-        return on_a_cluster(plan, pieces, dask)
+        return compute_on_cluster(plan, pieces, dask)
     count = workers or len(os.sched_getaffinity(0))
     if plan.through == "bus":
-        # Frames are the interpreter's work: only other processes have another one.
+        # Frames are handled by the interpreter, so threads would share one lock.
         context = multiprocessing.get_context("spawn")
-        return _in_a_pool(plan, pieces, ProcessPoolExecutor(count, context, _prepare_process))
-    return _in_a_pool(plan, pieces, ThreadPoolExecutor(count))
+        return _compute_in_pool(plan, pieces, ProcessPoolExecutor(count, context, _init_process))
+    return _compute_in_pool(plan, pieces, ThreadPoolExecutor(count))
 
 
-def _prepare_process() -> None:
-    """Ctrl-C is for the process that asked for the work; its cores are for the pieces."""
+def _init_process() -> None:
+    """Leave Ctrl-C to the parent process, and the cores to the pieces."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _one_core_each()
+    _limit_blas_threads()
 
 
-def _one_core_each() -> threadpool_limits:
-    """BLAS without threads of its own until the context ends, which is not at all if none begins.
+def _limit_blas_threads() -> threadpool_limits:
+    """Limit BLAS to one thread, until the returned context ends.
 
-    For matrices as small as a strike's they bring nothing, but wait awake on a core afterwards.
+    For matrices as small as a strike's its threads gain nothing, and spin on a core afterwards.
     """
     return threadpool_limits(1, user_api="blas")
 
 
-def _in_a_pool(plan: Plan, pieces: Sequence[int], pool: Executor) -> Iterator[Found]:
-    with _one_core_each():
+def _compute_in_pool(plan: Plan, pieces: Sequence[int], pool: Executor) -> Iterator[PieceResult]:
+    with _limit_blas_threads():
         try:
-            jobs = {pool.submit(compute, plan, piece): piece for piece in pieces}
+            jobs = {pool.submit(compute_piece, plan, piece): piece for piece in pieces}
             for job in as_completed(jobs):
                 yield jobs[job], job.result()
         finally:

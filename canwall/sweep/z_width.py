@@ -1,4 +1,4 @@
-"""The Z-width map: where no strike chatters, and the analytic limits over it (section 6)."""
+"""Z-width map: walls on which no strike chatters, with the analytic limits (theory, section 6)."""
 
 from dataclasses import dataclass
 
@@ -18,18 +18,18 @@ from canwall.analysis.analytic_limits import (
     stable_stiffness,
 )
 from canwall.sweep.axes import DAMPING, STIFFNESS, STRIKES
-from canwall.sweep.labels import LABELS, named
+from canwall.sweep.labels import LABELS, axis_name
 
 Array = NDArray[np.float64]
 
 _FREE, _CHATTERS = "#cfe8dc", "#f6d5c3"
-#: Points of a line.
+#: Points of each line.
 _POINTS = 60
 
 
 @dataclass(frozen=True)
-class _Limit:
-    """A line of largest stiffnesses [N·m/rad] over the damping [N·m·s/rad]; or one point."""
+class _LimitLine:
+    """Largest stiffnesses [N·m/rad] over dampings [N·m·s/rad], as a line or a single point."""
 
     label: str
     stiffness: Array
@@ -40,8 +40,8 @@ class _Limit:
 
 
 def draw_z_width(axes: Axes, dataset: xr.Dataset) -> None:
-    """The map of one condition, K over B, and the limits of a spring and damper with its plant."""
-    stiffness, damping = (named(dataset, pair) for pair in (STIFFNESS, DAMPING))
+    """Draw the map of one condition, K against B, with the limits of a spring-damper wall."""
+    stiffness, damping = (axis_name(dataset, pair) for pair in (STIFFNESS, DAMPING))
     mass, period = dataset["inertia"].item(), dataset["period"].item()
     x_unit = mass / period**2 if stiffness == "stiffness_normalised" else 1.0
     y_unit = mass / period if damping == "damping_normalised" else 1.0
@@ -61,11 +61,11 @@ def draw_z_width(axes: Axes, dataset: xr.Dataset) -> None:
     )
     left, right = dataset[stiffness].values[[0, -1]]
     low, high = dataset[damping].values[[0, -1]]
-    for limit in _limits(dataset, low * y_unit, high * y_unit):
+    for limit in _analytic_limits(dataset, low * y_unit, high * y_unit):
         x, y = limit.stiffness / x_unit, limit.damping / y_unit
         is_point = len(x) == 1
         if not np.any((left <= x) & (x <= right) & (low <= y) & (y <= high)):
-            continue  # what is beyond the map has no place in its legend either
+            continue  # a line outside the map would still be in its legend
         axes.add_line(
             Line2D(
                 x,
@@ -74,7 +74,7 @@ def draw_z_width(axes: Axes, dataset: xr.Dataset) -> None:
                 ls=limit.dashes,
                 marker=limit.mark,
                 ms=7,
-                # A point on the edge is seen whole.
+                # Do not cut off a point on the edge.
                 clip_on=not is_point,
                 zorder=3,
                 label=limit.label,
@@ -87,19 +87,19 @@ def draw_z_width(axes: Axes, dataset: xr.Dataset) -> None:
     axes.set_ylabel(LABELS[damping])
 
 
-def _limits(dataset: xr.Dataset, low: float, high: float) -> list[_Limit]:
-    """Those that are known for the delay of the map, over dampings from low to high."""
+def _analytic_limits(dataset: xr.Dataset, low: float, high: float) -> list[_LimitLine]:
+    """Return the limits that exist for the delay of the map, for dampings from low to high."""
     mass, viscous, device, period, delay = (
         dataset[name].item()
         for name in ("inertia", "viscous", "device_viscous", "period", "loop_delay")
     )
-    # Passivity ends where B comes to the device's own damping: that may be a small part of the map.
+    # Passivity ends at B equal to the device's own damping, which may be a small part of the map.
     fine = np.linspace(0.0, device, _POINTS // 3)
     dampings = np.linspace(low, high, _POINTS)
     dampings = np.unique(np.concatenate((dampings, fine[(low <= fine) & (fine <= high)])))
     approximate = [delayed_stiffness(viscous, b, period, delay) for b in dampings]
-    found = [
-        _Limit(
+    lines = [
+        _LimitLine(
             "spring and damper: (b + B)/(T/2 + D·T)",
             np.array(approximate),
             dampings,
@@ -107,14 +107,14 @@ def _limits(dataset: xr.Dataset, low: float, high: float) -> list[_Limit]:
         )
     ]
     if delay not in CEILINGS and delay != int(delay):
-        return found
+        return lines
     whole = int(delay)
     exact = [stable_stiffness(mass, viscous, b, period, whole) for b in dampings]
-    found.append(_Limit("the same, exact", np.array(exact), dampings, "#000000", "--"))
+    lines.append(_LimitLine("the same, exact", np.array(exact), dampings, "#000000", "--"))
     if whole in CEILINGS:
         ceiling, at = CEILINGS[whole]
-        found.append(
-            _Limit(
+        lines.append(
+            _LimitLine(
                 "the same, ceiling at b = 0",
                 np.array([ceiling * mass / period**2]),
                 np.array([at * mass / period]),
@@ -125,8 +125,8 @@ def _limits(dataset: xr.Dataset, low: float, high: float) -> list[_Limit]:
         )
     if whole in (0, 1):
         passive = [passive_stiffness(device, b, period, whole) for b in dampings]
-        found.append(
-            _Limit(
+        lines.append(
+            _LimitLine(
                 "passive with any operator (Colgate, Schenkel)",
                 np.array(passive),
                 dampings,
@@ -138,8 +138,8 @@ def _limits(dataset: xr.Dataset, low: float, high: float) -> list[_Limit]:
         limit = quantised_stiffness(
             device, dataset["coulomb"].item(), dataset["count"].item(), period
         )
-        found.append(
-            _Limit(
+        lines.append(
+            _LimitLine(
                 "passive with encoder, B = 0 (Abbott, Okamura)",
                 np.array([limit]),
                 np.array([0.0]),
@@ -148,4 +148,4 @@ def _limits(dataset: xr.Dataset, low: float, high: float) -> list[_Limit]:
                 "^",
             )
         )
-    return found
+    return lines

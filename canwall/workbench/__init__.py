@@ -1,16 +1,16 @@
-"""The workbench: a ball on the floor that is the wall, and the figures drawn from it.
+"""Workbench: a ball that bounces on the wall as its floor, and the figures drawn from it.
 
-The ball is the handle with everything left out that a bench adds: exact state, no delay, no
-quantisation. What a law does wrong here is the law's own.
+The ball is a handle without the imperfections of a bench: its state is exact, without delay or
+quantisation, so every deviation is the law's own.
 """
 
 from canwall.workbench.ball import (
     CONTINUOUS,
     Ball,
-    bounced,
     continuous_ball,
     sampled_ball,
+    simulate_ball,
     write_ball,
 )
 
-__all__ = ["CONTINUOUS", "Ball", "bounced", "continuous_ball", "sampled_ball", "write_ball"]
+__all__ = ["CONTINUOUS", "Ball", "continuous_ball", "sampled_ball", "simulate_ball", "write_ball"]

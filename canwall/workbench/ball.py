@@ -1,7 +1,7 @@
-"""The bouncing ball: driven by held forces (Table 5.2), and on the continuous floor (Table 5.3).
+"""Bouncing ball under held forces (Table 5.2), and on the continuous floor (Table 5.3).
 
-m·ÿ + b·ẏ + k_h·y = f − m·g over the floor at y = 0. The law gets the exact state and the exact
-bias force, and its force takes effect at once: D = 0.
+m·ÿ + b·ẏ + k_h·y = f − m·g, with the floor at y = 0. The law gets the exact state and the exact
+bias force, and its force acts at once: D = 0.
 """
 
 import math
@@ -30,20 +30,36 @@ from canwall.walls.interface import free_step
 
 Array = NDArray[np.float64]
 
-#: What stands for a law's name where the continuous referent is meant.
+#: Name that stands for the continuous referent in the place of a law's.
 CONTINUOUS = "continuous"
-#: What a ball's record may hold, and how hard its floor may be for the sample rate: the referent
-#: is followed through every quarter of its swings.
+#: Largest number of samples.
 MAX_PERIODS = 100_000_000
+#: Largest θ: the referent is computed in steps of a quarter of its oscillation.
 MAX_THETA = 1e4
 
 
 @dataclass(frozen=True)
 class Ball:
-    """What bounces on what, from where, sampled how often.
+    """A ball, its floor, its initial state, and the sampling.
 
-    Units: kg, N·s/m, N/m, m/s², m, s, or any other consistent set. Raises InputError for what no
-    ball can be.
+    Units are SI, or any other consistent set.
+
+    Attributes:
+        stiffness: Stiffness K of the floor [N/m].
+        damping: Damping B of the floor [N·s/m].
+        mass: Mass m of the ball [kg].
+        viscous: Viscous damping b of the ball [N·s/m].
+        spring: Spring k_h on the ball, with its rest at the floor [N/m].
+        gravity: Gravity g [m/s²].
+        height: Height at the start [m].
+        speed: Velocity at the start, upwards [m/s].
+        period: Sampling period T [s].
+        periods: Number of periods.
+        tension: Policy for pulling forces, a key of TENSION.
+        passivity: Damping of the passivity controller.
+
+    Raises:
+        InputError: If a value is out of range.
     """
 
     stiffness: float = 1.0
@@ -79,22 +95,33 @@ class Ball:
 
     @property
     def theta(self) -> float:
-        """θ = T·√(K/m): how hard the floor is for its sample rate."""
+        """θ = T·√(K/m), the stiffness of the floor relative to the sample rate."""
         return self.period * math.sqrt(self.stiffness / self.mass)
 
     def energy(self, y: Array, v: Array) -> Array:
-        """Energy of the ball, with what the floor's spring holds of it; any shape."""
+        """Return the energy of the ball and of the floor's spring [J], in the shape of y and v."""
         floor = np.where(y < 0.0, self.stiffness, 0.0)
         potential = self.mass * self.gravity * y + 0.5 * (self.spring + floor) * y * y
         return np.asarray(0.5 * self.mass * v * v + potential)
 
 
-def bounced(
+def simulate_ball(
     ball: Ball, law: str, deadbeat: bool = False, options: Mapping[str, float] | None = None
 ) -> tuple[Array, Array, Array]:
-    """(y, ẏ, f) of `sampled_ball` for the law of that name, or of `continuous_ball`.
+    """Simulate the ball on a floor rendered by a law, or on the continuous floor.
 
-    Raises UnknownLawError, and RunFailedError where the trajectory overflows.
+    Args:
+        ball: Ball and floor.
+        law: Name of a law, or CONTINUOUS.
+        deadbeat: Add the deadbeat compensation.
+        options: Options of the law.
+
+    Returns:
+        (y, ẏ, f) as from `sampled_ball` or `continuous_ball`.
+
+    Raises:
+        UnknownLawError: If the law or an option does not exist.
+        RunFailedError: If the trajectory overflows.
     """
     if law == CONTINUOUS:
         trajectory = continuous_ball(ball)
@@ -103,12 +130,12 @@ def bounced(
     lost = ~np.isfinite(np.sum(trajectory, axis=0))
     if lost.any():
         instant = float(lost.argmax()) * ball.period
-        raise RunFailedError(f"{law}: the ball is beyond all numbers at t = {instant:g}")
+        raise RunFailedError(f"{law}: the trajectory overflows at t = {instant:g}")
     return trajectory
 
 
 def write_ball(path: Path, ball: Ball, y: Array, v: Array, force: Array) -> None:
-    """CSV with columns t, y, v, f; all digits of a double. Raises InputError."""
+    """Write a CSV file with columns t, y, v, f in full precision. Raises InputError."""
     table = np.column_stack([np.arange(len(y)) * ball.period, y, v, force])
     try:
         np.savetxt(path, table, fmt="%.17g", delimiter=",", header="t,y,v,f", comments="")
@@ -119,10 +146,19 @@ def write_ball(path: Path, ball: Ball, y: Array, v: Array, force: Array) -> None
 def sampled_ball(
     ball: Ball, law: Law, options: Mapping[str, float] = MappingProxyType({})
 ) -> tuple[Array, Array, Array]:
-    """(y, ẏ, f) at the samples 0 … periods, each of shape (periods + 1,); the last f is 0.
+    """Simulate the ball on a floor rendered by a law.
 
-    f[j] is held from sample j to the next. Raises UnknownLawError for an option that the law
-    does not have.
+    Args:
+        ball: Ball and floor.
+        law: Law of the floor.
+        options: Options of the law.
+
+    Returns:
+        (y, ẏ, f) at the samples 0 … periods, each of shape (periods + 1,). f[j] is held from
+        sample j to the next; the last f is 0.
+
+    Raises:
+        UnknownLawError: If the law does not have an option.
     """
     wall = np.zeros(1, WALL)
     set_plant(wall, ball.mass, ball.viscous, ball.spring, ball.period)
@@ -137,13 +173,16 @@ def sampled_ball(
 
 @compiled
 def bounce(walls: NDArray[np.void], address: int, y: float, v: float, trajectory: Array) -> None:
-    """Fill (y, ẏ, f), shape (3, n + 1), from the state (y, v); walls has dtype WALL, shape (1,)."""
+    """Fill the trajectory (y, ẏ, f), shape (3, n + 1), starting at the state (y, v).
+
+    walls has shape (1,) and dtype WALL; address is the law's.
+    """
     wall: Record = walls[0]
     periods = trajectory.shape[1] - 1
     y_before = y
     for j in range(periods):
         wall.y = wall.y_sample = y
-        # At the first sample there is no difference yet; then it is the backward difference.
+        # The backward difference; at the first sample there is none.
         wall.v = v
         wall.v_sample = v if j == 0 else (y - y_before) / wall.period
         force = wall_force(address, wall)
@@ -158,20 +197,24 @@ def bounce(walls: NDArray[np.void], address: int, y: float, v: float, trajectory
 
 
 def continuous_ball(ball: Ball) -> tuple[Array, Array, Array]:
-    """(y, ẏ, f) of the ball on the continuous floor, at the same samples as `sampled_ball`.
+    """Simulate the ball on the continuous floor.
 
-    f is the floor's force at the sample; the last is 0, as there.
+    Returns:
+        (y, ẏ, f) at the samples 0 … periods, each of shape (periods + 1,). f is the force of the
+        floor at the sample; the last is 0, as in `sampled_ball`.
     """
     plant = make_plant(ball.mass, ball.viscous, ball.spring, 0.0, ball.stiffness, ball.damping)
     y, v = np.zeros(ball.periods + 1), np.zeros(ball.periods + 1)
     y[0], v[0] = ball.height, ball.speed
-    _follow(plant, -ball.mass * ball.gravity, ball.period, y, v)
+    _advance_samples(plant, -ball.mass * ball.gravity, ball.period, y, v)
     force = np.where(y < 0.0, -ball.stiffness * y - ball.damping * v, 0.0)
     force[-1] = 0.0
     return y, v, force
 
 
 @compiled
-def _follow(plants: NDArray[np.void], bias: float, period: float, y: Array, v: Array) -> None:
+def _advance_samples(
+    plants: NDArray[np.void], bias: float, period: float, y: Array, v: Array
+) -> None:
     for j in range(len(y) - 1):
         y[j + 1], v[j + 1], _ = advance(plants[0], y[j], v[j], bias, 0.0, period)

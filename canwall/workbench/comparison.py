@@ -1,7 +1,7 @@
-"""One page of the project's own: every law on the same floor, softer to harder.
+"""Comparison of all laws on the same floor, as a figure of its own.
 
-A ball of 1 kg under 1 m/s² meets a floor of 1 N/m at 5 m/s; the period T of the laws runs, so
-θ = T·√(K/m) does, and the ball comes at many instants of a period.
+A ball of 1 kg under 1 m/s² meets a floor of 1 N/m at 5 m/s. The period T varies, and with it
+θ = T·√(K/m), and for each T the phase at which the ball enters.
 """
 
 from collections.abc import Iterator, Mapping
@@ -24,62 +24,67 @@ Array = NDArray[np.float64]
 ENTRY_SPEED = 5.0
 #: Damping of the floors that have one: ζ = 0.1 [N·s/m].
 DAMPING = 0.2
-#: Softest and hardest floor for its sample rate.
+#: Range of θ.
 THETA = (0.05, 3.0)
-#: Longer than any contact [s], with some more periods where these are long.
+#: Time that exceeds any contact [s], and further periods for large T.
 _CONTACT_S, _PERIODS = 12.0, 8
-#: Up to this the axis of the energy is linear.
+#: Bound of the linear part of the energy axis.
 _LINEAR = 1e-3
-#: What rounding may add to ln E.
+#: Gain in ln E that rounding may cause.
 _ROUNDING = 1e-9
-#: The palette's lines; its yellow is for areas.
+#: Colours of lines: the palette without its yellow, which is too light for them.
 _LINES = (*COLOURS[:6], COLOURS[7])
 
 
 @dataclass(frozen=True)
-class Choice:
-    """How a law is set for the comparison.
+class LawParameters:
+    """Damping and options of a law in the comparison.
 
-    The options that laws have are a bench's, in radians; those here suit a ball that dives 6 m.
+    The defaults of the options suit a bench, in radians; those here suit a ball that dives 6 m.
     """
 
     damping: float = 0.0
     options: Mapping[str, float] = field(default_factory=dict)
 
 
-#: The laws by what they know.
-GROUPS: dict[str, dict[str, Choice]] = {
+#: The laws, grouped by the knowledge that they use.
+GROUPS: dict[str, dict[str, LawParameters]] = {
     "laws without a model": {
-        "standard": Choice(),
-        "damped": Choice(DAMPING),
-        "hysteresis": Choice(options={"softening": 0.8}),
-        "exponential": Choice(options={"length": 10.0}),
-        "thresholded_damper": Choice(DAMPING, {"threshold": 1.0}),
-        "unidirectional_damper": Choice(DAMPING),
-        "offset_damper": Choice(DAMPING, {"offset": -1.0}),
+        "standard": LawParameters(),
+        "damped": LawParameters(DAMPING),
+        "hysteresis": LawParameters(options={"softening": 0.8}),
+        "exponential": LawParameters(options={"length": 10.0}),
+        "thresholded_damper": LawParameters(DAMPING, {"threshold": 1.0}),
+        "unidirectional_damper": LawParameters(DAMPING),
+        "offset_damper": LawParameters(DAMPING, {"offset": -1.0}),
     },
     "laws that predict": {
-        "midpoint": Choice(),
-        "half_sample": Choice(),
-        "pole_placement": Choice(),
-        "half_sample+deadbeat": Choice(),
-        "pole_placement+deadbeat": Choice(),
+        "midpoint": LawParameters(),
+        "half_sample": LawParameters(),
+        "pole_placement": LawParameters(),
+        "half_sample+deadbeat": LawParameters(),
+        "pole_placement+deadbeat": LawParameters(),
     },
     "laws that plan an interval or a contact": {
-        "mean_force": Choice(),
-        "two_step": Choice(),
-        "push_only": Choice(),
-        "rigid": Choice(options={"restitution": 1.0}),
+        "mean_force": LawParameters(),
+        "two_step": LawParameters(),
+        "push_only": LawParameters(),
+        "rigid": LawParameters(options={"restitution": 1.0}),
     },
 }
 
 
 @dataclass(frozen=True)
 class LawResult:
-    """One law at one θ, over all phases of entry.
+    """Result of a law at one θ, over all phases of entry.
 
-    Change of ln E by a bounce (mean, least, most), largest tension and largest force [N], and
-    the share of the balls that came out again at all: of the others there is no change to tell.
+    Attributes:
+        mean: Mean change of ln E in the first bounce.
+        least: Smallest change.
+        most: Largest change.
+        tension: Largest pulling force [N].
+        peak: Largest force [N].
+        out: Share of the balls that left the floor again; the others have no change of ln E.
     """
 
     mean: float
@@ -91,7 +96,7 @@ class LawResult:
 
     @classmethod
     def of(cls, strikes: list[Bounces]) -> "LawResult":
-        """Of the first contact of each."""
+        """Evaluate the first contact of each ball."""
         gains = np.array([strike.gains[0] for strike in strikes if len(strike.gains)])
         forces = np.concatenate(
             [s.force[: s.contacts[0].stop] if s.contacts else s.force for s in strikes]
@@ -107,37 +112,33 @@ class LawResult:
         )
 
 
-def floor(period: float, damping: float = 0.0) -> Ball:
-    """The ball over its floor, for one contact at this period of the law."""
+def one_contact_ball(period: float, damping: float = 0.0) -> Ball:
+    """Return a ball that is simulated for one contact at this sampling period."""
     periods = round(_CONTACT_S / period) + _PERIODS
     return Ball(damping=damping, period=period, periods=periods)
 
 
-def measured(law: str, choice: Choice, theta: float, phases: int) -> LawResult:
-    """A law at one θ. Raises UnknownLawError."""
-    ball = floor(theta, choice.damping)
-    return LawResult.of(list(over_phases(ball, law, ENTRY_SPEED, phases, choice.options)))
+def law_result(law: str, parameters: LawParameters, theta: float, phases: int) -> LawResult:
+    """Simulate a law at one θ. Raises UnknownLawError."""
+    ball = one_contact_ball(theta, parameters.damping)
+    return LawResult.of(list(over_phases(ball, law, ENTRY_SPEED, phases, parameters.options)))
 
 
-def continuous(damping: float) -> LawResult:
-    """The continuous floor, for which θ and phase are nothing."""
-    return LawResult.of([Bounces.on(entering(floor(1e-3, damping), ENTRY_SPEED, 0.5), CONTINUOUS)])
+def continuous_result(damping: float) -> LawResult:
+    """Simulate the continuous floor, which depends on neither θ nor phase."""
+    ball = entering(one_contact_ball(1e-3, damping), ENTRY_SPEED, 0.5)
+    return LawResult.of([Bounces.on(ball, CONTINUOUS)])
 
 
-def thetas(count: int) -> Array:
-    """The floors that are compared."""
-    return np.geomspace(*THETA, count)
-
-
-def all_laws(count: int, phases: int) -> Iterator[FigurePage]:
-    """The page, for so many θ and phases of entry."""
-    grid = thetas(count)
+def draw_comparison(count: int, phases: int) -> Iterator[FigurePage]:
+    """Draw the comparison for `count` values of θ and `phases` phases of entry."""
+    grid = np.geomspace(*THETA, count)
     results = {
-        law: [measured(law, choice, theta, phases) for theta in grid]
+        law: [law_result(law, parameters, theta, phases) for theta in grid]
         for laws in GROUPS.values()
-        for law, choice in laws.items()
+        for law, parameters in laws.items()
     }
-    referents = {damping: continuous(damping) for damping in (0.0, DAMPING)}
+    referents = {damping: continuous_result(damping) for damping in (0.0, DAMPING)}
     figure = _draw(grid, results, referents)
     yield FigurePage(
         "all_laws",
@@ -157,8 +158,8 @@ def _values(results: list[LawResult], name: str) -> Array:
 def _shares(
     name: str, results: Mapping[str, list[LawResult]], referents: Mapping[float, LawResult]
 ) -> dict[str, Array]:
-    """A force of each law over the peak force of the continuous wall that it renders."""
-    damping = {law: choice.damping for laws in GROUPS.values() for law, choice in laws.items()}
+    """Divide a force of each law by the peak force of the continuous wall that it renders."""
+    damping = {law: chosen.damping for laws in GROUPS.values() for law, chosen in laws.items()}
     return {
         law: _values(of_law, name) / referents[damping[law]].peak for law, of_law in results.items()
     }
@@ -167,7 +168,7 @@ def _shares(
 def _columns(
     grid: Array, results: Mapping[str, list[LawResult]], referents: Mapping[float, LawResult]
 ) -> dict[str, NDArray[np.generic]]:
-    """One row for each law and θ."""
+    """Return the columns of the CSV file, with a row for each law and θ."""
     rows = [result for of_law in results.values() for result in of_law]
     tension, peak = (_shares(name, results, referents) for name in ("tension", "peak"))
     return {
@@ -183,7 +184,7 @@ def _columns(
 
 
 def passive_up_to(grid: Array, results: list[LawResult]) -> float:
-    """Largest θ up to which no phase of entry gains more than rounding; 0 where there is none."""
+    """Return the largest θ up to which no phase of entry gains energy; 0 if there is none."""
     gaining = np.flatnonzero(~(_values(results, "most") <= _ROUNDING))
     passive = grid[: gaining[0]] if len(gaining) else grid
     return float(passive[-1]) if len(passive) else 0.0
@@ -199,15 +200,15 @@ def _finding(grid: Array, results: Mapping[str, list[LawResult]]) -> str:
     kept = [f"{law} {1.0 - out:.0%}" for law, out in outs.items() if out < 1.0]
     return (
         f"No phase of entry gains more than {_ROUNDING:g} in ln E at any θ shown with "
-        f"{_listed(always)}, up to some θ with {_listed(partly)}, while already at "
-        f"θ = {grid[0]:g} some phase gains with {_listed(never)} (push_only plans no more than "
-        f"{HORIZON} periods at once). {_listed(pushing)} never pull; of the balls "
-        f"that come at the θ worst for it, some never come out again as far as they were followed, "
-        f"and do not count: {_listed(kept)}."
+        f"{_join(always)}, up to some θ with {_join(partly)}, while already at "
+        f"θ = {grid[0]:g} some phase gains with {_join(never)} (push_only plans at most "
+        f"{HORIZON} periods at once). {_join(pushing)} never pull. Balls that do not leave the "
+        f"floor within the simulated time are not counted; their share at the worst θ: "
+        f"{_join(kept)}."
     )
 
 
-def _listed(items: list[str]) -> str:
+def _join(items: list[str]) -> str:
     return ", ".join(items) or "none"
 
 
@@ -222,7 +223,7 @@ def _draw(
         energy.set_title(group)
         for number, law in enumerate(laws):
             found = results[law]
-            # Some laws agree to the last bit: broken lines, each in a rhythm of its own.
+            # Some laws agree to the last bit: different dashes keep both lines visible.
             style = {
                 "color": _LINES[number],
                 "lw": 1.6,
@@ -239,7 +240,7 @@ def _draw(
             )
             tension.plot(grid, tensions[law], **style)
             peak.plot(grid, peaks[law], **style)
-        if any(choice.damping for choice in laws.values()):
+        if any(chosen.damping for chosen in laws.values()):
             label = f"continuous, B = {DAMPING:g} N·s/m"
             energy.axhline(referents[DAMPING].mean, color=REFERENT, ls="--", lw=1.1, label=label)
         energy.axhline(0.0, color="k", lw=0.8, zorder=1, label="continuous, undamped")
@@ -247,11 +248,11 @@ def _draw(
         handles, labels = energy.get_legend_handles_labels()
         peak.legend(handles, labels, loc="upper center", bbox_to_anchor=(0.5, -0.22), ncols=2)
         peak.set_xlabel("θ = T·√(K/m)")
-    _scales(*grids[:, 0])
+    _set_scales(*grids[:, 0])
     return figure
 
 
-def _scales(energy: Axes, tension: Axes, peak: Axes) -> None:
+def _set_scales(energy: Axes, tension: Axes, peak: Axes) -> None:
     plain = FuncFormatter(lambda value, place: f"{value:g}")
     energy.set_xscale("log")
     energy.xaxis.set_major_locator(FixedLocator([0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 3.0]))

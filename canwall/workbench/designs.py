@@ -1,4 +1,4 @@
-"""Figures 5.8 to 5.17 of the source: the standard floor, and the controllers that replace it."""
+"""Figures 5.8 to 5.17 of the source: the standard floor and the controllers that replace it."""
 
 from collections.abc import Iterator
 
@@ -9,18 +9,18 @@ from numpy.typing import NDArray
 from canwall.workbench.ball import CONTINUOUS
 from canwall.workbench.bounces import Bounces
 from canwall.workbench.figure_page import FORCE, REFERENT, SAMPLES, FigurePage, blank, legend_below
-from canwall.workbench.traces import BALL, POINTS, POSITION, TIME, Traces, around, fall
+from canwall.workbench.traces import BALL, POINTS, POSITION, TIME, Traces, around, drop_ball
 
 Array = NDArray[np.float64]
 
-#: From where the balls fall that tell how typical Figure 5.12 is [m].
+#: Range of drop heights with which the variability in Figure 5.12 is judged [m].
 DROPS = (11.0, 13.0)
 
 
-def _short(
+def _draw_overview(
     name: str, title: str, bounces: Bounces, box: slice | None, claim: str, finding: str
 ) -> FigurePage:
-    """A few bounces beside the referent's, the close-up's part of them boxed."""
+    """Draw a few bounces with the referent's, and a box around the samples of the close-up."""
     traces = Traces.of(bounces)
     figure, axes = blank(title, TIME, POSITION)
     traces.draw(axes, samples=False)
@@ -35,10 +35,10 @@ def _short(
     return FigurePage(name, title, claim, finding, traces.columns(), figure)
 
 
-def _close_up(
+def _draw_close_up(
     name: str, title: str, bounces: Bounces, contact: slice, claim: str, finding: str
 ) -> FigurePage:
-    """One contact, the samples marked; a force that pulls filled out."""
+    """Draw one contact with its samples, and the area of a pulling force."""
     traces = Traces.of(bounces, around(contact))
     figure, axes = blank(title, TIME, POSITION)
     traces.draw(axes, samples=True)
@@ -58,13 +58,13 @@ def _close_up(
     return FigurePage(name, title, claim, finding, traces.columns(), figure)
 
 
-def sampled_data() -> Iterator[FigurePage]:
-    """Figures 5.8 and 5.9."""
-    bounces = fall("standard")
+def draw_standard_floor() -> Iterator[FigurePage]:
+    """Draw figures 5.8 and 5.9."""
+    bounces = drop_ball("standard")
     contact = bounces.contacts[0]
     heights = ", ".join(f"{h:.2f}" for h in bounces.heights)
-    kept = float(np.abs(fall(CONTINUOUS).heights - BALL.height).max())
-    yield _short(
+    kept = float(np.abs(drop_ball(CONTINUOUS).heights - BALL.height).max())
+    yield _draw_overview(
         "figure_5_08",
         "Figure 5.8: sampled-data ball on the standard floor",
         bounces,
@@ -75,7 +75,7 @@ def sampled_data() -> Iterator[FigurePage]:
     )
     leaving = bounces.v[contact.stop - 1]
     traces = Traces.of(bounces, around(contact))
-    yield _close_up(
+    yield _draw_close_up(
         "figure_5_09",
         "Figure 5.9: sampled-data ball on the standard floor, close-up",
         bounces,
@@ -89,30 +89,30 @@ def sampled_data() -> Iterator[FigurePage]:
     )
 
 
-def meetings(bounces: Bounces, contact: slice) -> Array:
-    """Where in its period each force of a contact meets the position that it stands for; 0 … 1.
+def force_crossing_phases(bounces: Bounces, contact: slice) -> Array:
+    """Return the phases, 0 … 1, at which the held forces of a contact fit the position: f = −K·y.
 
-    Left out are the periods within which they do not meet once: about the turning point, and
-    where the ball leaves.
+    Periods in which the position does not cross −f/K are left out: at the turning point and at
+    the end of the contact.
     """
-    found = [
-        bounces.passing(j, -bounces.force[j] / bounces.ball.stiffness)
+    times = [
+        bounces.crossing(j, -bounces.force[j] / bounces.ball.stiffness)
         for j in range(contact.start, contact.stop - 2)
     ]
-    return np.array([t / bounces.ball.period for t in found if np.isfinite(t)])
+    return np.array([t / bounces.ball.period for t in times if np.isfinite(t)])
 
 
 def strongest_pull(bounces: Bounces) -> slice:
-    """The contact in which the floor pulls most."""
+    """Return the contact in which the floor pulls most."""
     return min(bounces.contacts, key=lambda c: float(bounces.force[c].min()))
 
 
-def half_sample() -> Iterator[FigurePage]:
-    """Figures 5.10 and 5.11."""
-    bounces, standard = fall("half_sample"), fall("standard")
+def draw_half_sample() -> Iterator[FigurePage]:
+    """Draw figures 5.10 and 5.11."""
+    bounces, standard = drop_ball("half_sample"), drop_ball("standard")
     contact = strongest_pull(bounces)
     off = np.abs(bounces.heights[1:] / BALL.height - 1.0)
-    yield _short(
+    yield _draw_overview(
         "figure_5_10",
         "Figure 5.10: half-sample prediction",
         bounces,
@@ -123,26 +123,26 @@ def half_sample() -> Iterator[FigurePage]:
         f"(standard floor, after {len(standard.contacts)}: {standard.heights[-1]:.2f} m); it is "
         f"off the {BALL.height:g} m by up to {off.max():.1%}.",
     )
-    met = meetings(bounces, contact)
+    phases = force_crossing_phases(bounces, contact)
     last = contact.stop - 2
     pull = -bounces.force[last]
     taken = pull * (bounces.y[last + 1] - bounces.y[last])
-    yield _close_up(
+    yield _draw_close_up(
         "figure_5_11",
         "Figure 5.11: half-sample prediction, close-up",
         bounces,
         contact,
         "The stairs of the held force meet the position about midway between the samples; in the "
         "last period of the contact the floor pulls, and the ball does work on it.",
-        f"They meet at {met.mean():.3f} of the period ({met.min():.3f} to {met.max():.3f}, "
-        f"{len(met)} periods). In the last one the floor pulls with {pull:.3f} N and takes "
-        f"{taken:.3f} J.",
+        f"They meet at {phases.mean():.3f} of the period ({phases.min():.3f} to "
+        f"{phases.max():.3f}, {len(phases)} periods). In the last one the floor pulls with "
+        f"{pull:.3f} N and takes {taken:.3f} J.",
     )
 
 
-def long_term(seconds: float, drops: int) -> Iterator[FigurePage]:
-    """Figure 5.12 over that time; how typical it is from this many heights of drop."""
-    bounces = fall("half_sample", seconds)
+def draw_long_term(seconds: float, drops: int) -> Iterator[FigurePage]:
+    """Draw figure 5.12 over this time, and judge its variability with `drops` drop heights."""
+    bounces = drop_ball("half_sample", seconds)
     t, y = bounces.between(POINTS)
     title = "Figure 5.12: half-sample prediction, long-term"
     figure, axes = blank(title, TIME, "height y [m]", (11.0, 4.6))
@@ -156,7 +156,7 @@ def long_term(seconds: float, drops: int) -> Iterator[FigurePage]:
     heights = bounces.heights[1:]
     both = sum(
         h.min() < 0.99 * h[0] and h.max() > 1.01 * h[0]
-        for h in (fall("half_sample", seconds, s).heights for s in np.linspace(*DROPS, drops))
+        for h in (drop_ball("half_sample", seconds, s).heights for s in np.linspace(*DROPS, drops))
     )
     yield FigurePage(
         "figure_5_12",
@@ -165,20 +165,20 @@ def long_term(seconds: float, drops: int) -> Iterator[FigurePage]:
         f"Over {len(heights)} bounces the height lies between {heights.min() / BALL.height:.1%} "
         f"and {heights.max() / BALL.height:.1%} of the target; ln E changes by "
         f"{bounces.gains.mean():+.4f} a bounce, standard deviation {bounces.gains.std():.4f}. Of "
-        f"{drops} drops from {DROPS[0]:g} to {DROPS[1]:g} m {both} come out "
-        "more than 1% above their height as well as more than 1% below it in this time.",
+        f"{drops} drops from {DROPS[0]:g} to {DROPS[1]:g} m {both} deviate both more than 1% above "
+        "and more than 1% below their first height in this time.",
         {"t [s]": t, "y rendered [m]": y, "y target [m]": np.full(len(t), BALL.height)},
         figure,
     )
 
 
-def digital_design() -> Iterator[FigurePage]:
-    """Figure 5.14."""
-    bounces, other = fall("pole_placement"), fall("half_sample")
+def draw_pole_placement() -> Iterator[FigurePage]:
+    """Draw figure 5.14."""
+    bounces, other = drop_ball("pole_placement"), drop_ball("half_sample")
     count = min(len(bounces.heights), len(other.heights))
     apart = np.abs(bounces.heights[:count] / other.heights[:count] - 1.0)
     off = np.abs(bounces.heights[1:] / BALL.height - 1.0)
-    yield _short(
+    yield _draw_overview(
         "figure_5_14",
         "Figure 5.14: controller designed in the digital domain (pole placement)",
         bounces,
@@ -190,15 +190,15 @@ def digital_design() -> Iterator[FigurePage]:
     )
 
 
-def with_deadbeat() -> Iterator[FigurePage]:
-    """Figures 5.16 and 5.17."""
-    bounces = fall("half_sample+deadbeat")
+def draw_deadbeat() -> Iterator[FigurePage]:
+    """Draw figures 5.16 and 5.17."""
+    bounces = drop_ball("half_sample+deadbeat")
     contact = strongest_pull(bounces)
     error = np.abs(bounces.heights / BALL.height - 1.0).max()
     traces = Traces.of(bounces)
     outside = (traces.at_sample == 1) & (traces.y >= 0.0) & (traces.force == 0.0)
     apart = np.abs(traces.y - traces.referent)
-    yield _short(
+    yield _draw_overview(
         "figure_5_16",
         "Figure 5.16: full control algorithm (half-sample prediction with deadbeat)",
         bounces,
@@ -212,7 +212,7 @@ def with_deadbeat() -> Iterator[FigurePage]:
     forces = bounces.force[last - 1 : last + 1]
     part = Traces.of(bounces, around(contact))
     inside = np.abs(part.y - part.referent).max()
-    yield _close_up(
+    yield _draw_close_up(
         "figure_5_17",
         "Figure 5.17: full control algorithm, close-up",
         bounces,

@@ -1,4 +1,4 @@
-"""Figures 5.3 and 5.4 of the source: where the energy of the standard wall comes from."""
+"""Figures 5.3 and 5.4 of the source: the origin of the energy that the standard wall puts out."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -19,40 +19,40 @@ from canwall.workbench.figure_page import (
     legend_below,
     stairs,
 )
-from canwall.workbench.traces import BALL, POSITION, SHORT_S, TIME, Traces, around, fall
+from canwall.workbench.traces import BALL, POSITION, SHORT_S, TIME, Traces, around, drop_ball
 
 Array = NDArray[np.float64]
 
-#: Entry speed for what is told of all phases of entry (theory, section 7) [m/s].
+#: Entry speed of the balls with which all phases of entry are judged (theory, section 7) [m/s].
 ENTRY_SPEED = 5.0
-#: More than one contact of the ball takes, and less than it takes to the next [s].
+#: Time that includes one contact of the ball, but not the next [s].
 _ONE_BOUNCE_S = 10.0
 
 
 def gains_over_phases(law: str, phases: int, tension: str = "allow") -> Array:
-    """Change of ln E by one bounce, for entries spread evenly over a period; shape (phases,)."""
+    """Return the change of ln E in a bounce for evenly spread phases of entry, shape (phases,)."""
     ball = replace(BALL, tension=tension, periods=round(_ONE_BOUNCE_S / BALL.period))
     strikes = over_phases(ball, law, ENTRY_SPEED, phases)
     return np.array([strike.gains[0] for strike in strikes])
 
 
 def work_in_and_out(bounces: Bounces, contact: slice) -> tuple[float, float]:
-    """Work done on the floor while the ball moves in, and by it while the ball moves out [J]."""
+    """Return the work done on the floor on the way in, and by the floor on the way out [J]."""
     traces = Traces.of(bounces, slice(contact.start - 1, contact.stop - 1))
     work = traces.force[:-1] * np.diff(traces.y)
     return float(-work[work < 0.0].sum()), float(work[work > 0.0].sum())
 
 
-def tracing_out() -> Iterator[FigurePage]:
-    """Figure 5.3."""
-    bounces = fall("standard")
+def draw_hysteresis_loop() -> Iterator[FigurePage]:
+    """Draw figure 5.3."""
+    bounces = drop_ball("standard")
     contact = bounces.contacts[0]
     traces = Traces.of(bounces, slice(contact.start - 1, contact.stop - 1))
     depth = -traces.y
     deepest = float(depth.max())
     title = "Figure 5.3: tracing out the virtual wall"
     figure, axes = blank(title, "penetration x = −y [m]", "force f out of the wall [N]", (7.0, 5.4))
-    # Held over each interval: along x at constant force, then the step to the next.
+    # Held over each interval: a line along x at constant force, then the step to the next force.
     x, force = np.repeat(depth, 2)[1:], np.repeat(traces.force, 2)[:-1]
     axes.fill(x, force, color=FORCE, alpha=0.15, lw=0.0, label="energy put out")
     axes.plot(x, force, color=FORCE, lw=1.3, label="held force")
@@ -94,23 +94,23 @@ def tracing_out() -> Iterator[FigurePage]:
 
 
 def continuous_work() -> float:
-    """What the ball's first contact takes and gives on the continuous floor: ½·K·x² [J]."""
+    """Return the work of the first contact on the continuous floor, in and out: ½·K·x² [J]."""
     depth = -continuous_between(replace(BALL, periods=round(SHORT_S / BALL.period)), 200).min()
     return float(0.5 * BALL.stiffness * depth**2)
 
 
 def switching_delays(bounces: Bounces, contact: slice) -> tuple[float, float]:
-    """(Δt_a, Δt_b): from crossing the threshold to the sample that switches the wall [s]."""
+    """Return (Δt_a, Δt_b) from crossing the threshold to the sample that switches the wall [s]."""
     period = bounces.ball.period
     return (
-        period - bounces.passing(contact.start - 1),
-        period - bounces.passing(contact.stop - 2),
+        period - bounces.crossing(contact.start - 1),
+        period - bounces.crossing(contact.stop - 2),
     )
 
 
-def time_chart(phases: int) -> Iterator[FigurePage]:
-    """Figure 5.4; its effect on the energy from this many phases of entry."""
-    bounces = fall("standard")
+def draw_time_chart(phases: int) -> Iterator[FigurePage]:
+    """Draw figure 5.4, and judge the effect on the energy with this many phases of entry."""
+    bounces = drop_ball("standard")
     contact = bounces.contacts[0]
     traces = Traces.of(bounces, around(contact))
     title = "Figure 5.4: time chart of one strike"
@@ -141,7 +141,7 @@ def time_chart(phases: int) -> Iterator[FigurePage]:
     stored = 0.5 * BALL.stiffness * bounces.y[contact.start] ** 2
     pushed = bounces.force[contact.stop - 2] * bounces.y[contact.stop - 1]
     standard, pulling, pushing = (
-        _spread(gains_over_phases(law, phases, tension))
+        _format_spread(gains_over_phases(law, phases, tension))
         for law, tension in (
             ("standard", "allow"),
             ("half_sample", "allow"),
@@ -153,15 +153,15 @@ def time_chart(phases: int) -> Iterator[FigurePage]:
         title,
         "The wall is switched on Δt_a after the threshold, with its spring compressed by no work, "
         "and off Δt_b after it; both delays are energy-producing.",
-        f"Δt_a = {on_s:.4f} s, with {stored:.4f} J in the spring that nobody put there; "
+        f"Δt_a = {on_s:.4f} s, with {stored:.4f} J in the spring without any work done on it; "
         f"Δt_b = {off_s:.4f} s, in which the last force does {pushed:.4f} J. Over all phases of "
-        f"entry at {ENTRY_SPEED:g} m/s the strike changes ln E by {standard}; what the switching "
-        f"does when the hold is compensated (half_sample) is {pushing} for a wall that only "
-        f"pushes, and {pulling} for one that may pull.",
+        f"entry at {ENTRY_SPEED:g} m/s the strike changes ln E by {standard}; the switching alone, "
+        f"with the hold compensated (half_sample), by {pushing} for a wall that only pushes, and "
+        f"by {pulling} for one that may pull.",
         traces.columns(),
         figure,
     )
 
 
-def _spread(gains: Array) -> str:
+def _format_spread(gains: Array) -> str:
     return f"{gains.mean():+.4f} ({gains.min():+.4f} to {gains.max():+.4f})"

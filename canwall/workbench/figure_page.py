@@ -1,4 +1,4 @@
-"""A figure with its data and with what is to be said of it: on disk a PNG, a CSV, and a text."""
+"""A figure with its data, the claim of the source and the finding: PNG, CSV and Markdown."""
 
 import csv
 from collections.abc import Iterator, Mapping
@@ -17,14 +17,14 @@ from canwall.figure_style import COLOURS
 
 Array = NDArray[np.float64]
 
-# One colour for one thing, in every figure.
+# Colours with the same meaning in every figure.
 FORCE, RENDERED, SAMPLES, ACCENT = COLOURS[0], COLOURS[5], COLOURS[1], COLOURS[2]
 REFERENT = "0.25"
 
 
 @contextmanager
-def writing(folder: Path) -> Iterator[None]:
-    """What cannot be written there is an InputError."""
+def raising_input_error(folder: Path) -> Iterator[None]:
+    """Turn an OSError while the folder is written into an InputError."""
     try:
         yield
     except OSError as error:
@@ -33,9 +33,15 @@ def writing(folder: Path) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class FigurePage:
-    """One figure: `name` of its files, what the source claims of it, what the numbers show.
+    """One figure with its data and text.
 
-    columns are what is plotted, of one length; their names carry the units.
+    Attributes:
+        name: Name of its files.
+        title: Title.
+        claim: What the source says of it.
+        finding: What the numbers show.
+        columns: Plotted data by column name with unit, all of one length.
+        figure: The figure itself.
     """
 
     name: str
@@ -46,9 +52,9 @@ class FigurePage:
     figure: Figure
 
     def write(self, folder: Path) -> None:
-        """PNG and CSV into the folder; all digits of a double. Raises InputError."""
+        """Write PNG and CSV, in full precision, into the folder. Raises InputError."""
         rows = zip(*(column.tolist() for column in self.columns.values()), strict=True)
-        with writing(folder):
+        with raising_input_error(folder):
             self.figure.savefig(folder / f"{self.name}.png")
             with (folder / f"{self.name}.csv").open("w", encoding="utf-8", newline="") as file:
                 writer = csv.writer(file, lineterminator="\n")
@@ -56,7 +62,7 @@ class FigurePage:
                 writer.writerows(rows)
 
     def text(self) -> str:
-        """Its section of the index, in Markdown."""
+        """Return its section of the index, in Markdown."""
         return (
             f"## {self.title}\n\n![{self.title}]({self.name}.png)\n\n"
             f"*The chapter:* {self.claim}\n\n*Here:* {self.finding} "
@@ -65,7 +71,7 @@ class FigurePage:
 
 
 def blank(title: str, x: str, y: str, size: tuple[float, float] = (9.0, 4.6)) -> tuple[Figure, Any]:
-    """A figure of one pair of axes."""
+    """Make a figure with one pair of axes."""
     figure = Figure(figsize=size, layout="constrained", dpi=120)
     axes = figure.add_subplot()
     axes.set_title(title)
@@ -75,11 +81,11 @@ def blank(title: str, x: str, y: str, size: tuple[float, float] = (9.0, 4.6)) ->
 
 
 def legend_below(figure: Figure, axes: Axes) -> None:
-    """The legend where no data can be."""
+    """Put the legend below the axes, clear of the data."""
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=5)
 
 
 def stairs(axes: Axes, t: Array, level: Array, label: str, **style: Any) -> None:
-    """What is held from each sample to the next."""
+    """Draw a level that is held from each sample to the next."""
     axes.step(t, level, where="post", **{"color": FORCE, "lw": 1.3, "label": label, **style})

@@ -1,4 +1,4 @@
-"""Figures 5.18 and 5.19 of the source: four strikes on the simulated drive, through the bus."""
+"""Figures 5.18 and 5.19 of the source: four strikes on the simulated drive, over the bus."""
 
 import math
 import tempfile
@@ -12,7 +12,6 @@ import pyarrow as pa
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
-from scipy.optimize import brentq
 
 from canwall import config
 from canwall.analysis import metrics
@@ -27,30 +26,31 @@ from canwall.record.pictures import draw_strikes
 from canwall.run import run
 from canwall.units import DriveUnits, to_per_mille
 from canwall.walls import find_law, set_applied_force, wall_force
+from canwall.workbench.bounces import crossing_time
 from canwall.workbench.figure_page import REFERENT, FigurePage, blank, legend_below, stairs
 
 Array = NDArray[np.float64]
 
-#: Contacts of the first strike that the close-up shows, by number, and samples around them.
-_SHOWN = slice(1, 3)
+#: Contacts of the first strike in the close-up, by number, and samples around them.
+_CLOSE_UP = slice(1, 3)
 _AROUND = 2
 
 
 @dataclass(frozen=True)
-class Recorded:
-    """A run as it was recorded."""
+class RecordedRun:
+    """Settings, signals and summary of a recorded run."""
 
     settings: Settings
     signals: pa.Table
     summary: dict[str, Any]
 
     def column(self, name: str) -> Array:
-        """A column of the record, shape (cycles,)."""
+        """Return a column of the record, shape (cycles,)."""
         return np.asarray(self.signals[name].to_numpy(), dtype=np.float64)
 
 
-def recorded_run() -> Recorded:
-    """The run of config/sim.toml. Raises RunFailedError where it did not run to its end."""
+def record_run() -> RecordedRun:
+    """Run config/sim.toml. Raises RunFailedError if it trips or its record is incomplete."""
     settings = config.load(config.shipped("config/sim.toml"))
     with tempfile.TemporaryDirectory() as scratch:
         result = run(settings, Path(scratch) / "run")
@@ -58,48 +58,50 @@ def recorded_run() -> Recorded:
             raise KeyboardInterrupt
         if troubles := [*result.outcome.trips, *result.notes]:
             raise RunFailedError("; ".join(troubles))
-        return Recorded(settings, read_signals(result.folder.signals), result.summary)
+        return RecordedRun(settings, read_signals(result.folder.signals), result.summary)
 
 
-def four_strikes() -> Iterator[FigurePage]:
-    """Both figures, from one run."""
-    recorded = recorded_run()
-    yield _strikes(recorded)
-    yield _efforts(recorded)
+def draw_four_strikes() -> Iterator[FigurePage]:
+    """Draw both figures from one run."""
+    recorded = record_run()
+    yield _draw_strikes(recorded)
+    yield _draw_efforts(recorded)
 
 
-def close_up(recorded: Recorded) -> slice:
-    """The cycles of the close-up: the second and third contact of the first strike."""
+def close_up(recorded: RecordedRun) -> slice:
+    """Return the cycles of the close-up: the second and third contact of the first strike."""
     strike = recorded.summary["strikes"][0]
     start, end = (round(strike[k] / recorded.settings.bus.cycle_s) for k in ("start_s", "end_s"))
     y, force = recorded.column("y")[start:end], recorded.column("force_applied")[start:end]
-    shown = metrics.contacts(y, force)[_SHOWN]
-    return slice(start + shown[0].start - _AROUND, start + shown[-1].stop + _AROUND)
+    contacts = metrics.contacts(y, force)[_CLOSE_UP]
+    return slice(start + contacts[0].start - _AROUND, start + contacts[-1].stop + _AROUND)
 
 
-def effort(recorded: Recorded, wall: Wall) -> Array:
-    """Force that this wall, whatever was displayed, would hold from each SYNC on [N·m].
+def effort(recorded: RecordedRun, wall: Wall) -> Array:
+    """Compute the force that a wall of the run, displayed or not, would hold from each SYNC on.
 
-    What its law makes of the sample and of the state that the estimator found in each cycle, in
-    steps of the drive's torque and within its limit, in force one SYNC later (theory, section 3);
-    shape (cycles,). `wall` is one of the run's.
+    Its law gets the sample and the estimated state of each cycle. The force is quantised and
+    limited like the drive's torque, and acts one SYNC later (theory, section 3).
+
+    Returns:
+        Force [N·m], shape (cycles,).
     """
     settings, laws = recorded.settings, run_laws(recorded.settings)
     scales = recorded.summary["drive"]
     units = DriveUnits(math.tau / scales["rad_per_count"], 1000.0 * scales["nm_per_mille"])
-    # No frames are needed here: the record stands for what they carried.
-    nothing = PdoLayout(0, ())
-    cycle = make_cycle(settings, DriveSetup(units, 0, nothing, nothing), laws)
+    # The signals are recorded, so no PDO has to be decoded.
+    empty = PdoLayout(0, ())
+    cycle = make_cycle(settings, DriveSetup(units, 0, empty, empty), laws)
     set_wall(cycle, wall, laws)
     y = recorded.column("y")
     v = np.diff(y, prepend=y[0]) / settings.bus.cycle_s
-    seen = np.stack([y, v, *(recorded.column(c) for c in ("y_est", "v_est", "d_est"))])
+    inputs = np.stack([y, v, *(recorded.column(c) for c in ("y_est", "v_est", "d_est"))])
     held = np.zeros(len(y))
     address = find_law(wall.law, wall.deadbeat).address
-    _hold(
+    _fill_held_force(
         cycle["rendered"][0]["wall"][0],
         address,
-        seen,
+        inputs,
         units.nm_per_mille,
         settings.limits.torque_nm,
         held,
@@ -108,34 +110,33 @@ def effort(recorded: Recorded, wall: Wall) -> Array:
 
 
 @compiled
-def _hold(
-    walls: NDArray[np.void], address: int, seen: Array, step: float, limit: float, held: Array
+def _fill_held_force(
+    walls: NDArray[np.void], address: int, inputs: Array, step: float, limit: float, held: Array
 ) -> None:
     wall: Record = walls[0]
     for j in range(len(held) - 1):
-        wall.y_sample, wall.v_sample = seen[0, j], seen[1, j]
-        wall.y, wall.v, wall.d = seen[2, j], seen[3, j], seen[4, j]
+        wall.y_sample, wall.v_sample = inputs[0, j], inputs[1, j]
+        wall.y, wall.v, wall.d = inputs[2, j], inputs[3, j], inputs[4, j]
         held[j + 1] = to_per_mille(wall_force(address, wall), step, limit) * step
         set_applied_force(wall, held[j + 1])
 
 
-def meetings(t: Array, y: Array, level: Array) -> tuple[Array, int]:
-    """Where in its period each held level meets the position, 0 … 1, and of how many periods.
+def effort_crossing_phases(t: Array, y: Array, level: Array) -> tuple[Array, int]:
+    """Return the phases, 0 … 1, at which the position crosses the level held in a period.
 
-    Of the periods that begin inside the wall. Between the samples the position is taken from a
-    cubic spline through them.
+    Only periods that begin inside the wall are considered; the second value is their number.
+    Between samples the position is a cubic spline through them.
     """
-    position = CubicSpline(t, y)
+    spline = CubicSpline(t, y)
     inside = [j for j in range(len(t) - 1) if y[j] < 0.0 and level[j] != 0.0]
-    met = []
-    for j in inside:
-        if (y[j] - level[j]) * (y[j + 1] - level[j]) <= 0.0:
-            at = brentq(lambda s, f=level[j]: float(position(s)) - f, t[j], t[j + 1])
-            met.append((at - t[j]) / (t[j + 1] - t[j]))
-    return np.array(met), len(inside)
+    times = np.array(
+        [crossing_time(lambda s: float(spline(s)), level[j], t[j], t[j + 1]) for j in inside]
+    )
+    phases = (times - t[inside]) / np.diff(t)[inside]
+    return phases[np.isfinite(phases)], len(inside)
 
 
-def _strikes(recorded: Recorded) -> FigurePage:
+def _draw_strikes(recorded: RecordedRun) -> FigurePage:
     title = "Figure 5.18: four strikes of a virtual wall, with two controllers"
     figure, axes = blank(title, "time t [s]", "", (11.0, 4.8))
     strikes = recorded.summary["strikes"]
@@ -158,7 +159,7 @@ def _strikes(recorded: Recorded) -> FigurePage:
             zorder=3,
         )
     )
-    described = (
+    findings = (
         f"strike {number} ({strike['law']}): {strike['contacts']} "
         f"contact{'s' if strike['contacts'] > 1 else ''}, "
         + (
@@ -176,7 +177,7 @@ def _strikes(recorded: Recorded) -> FigurePage:
         "Four strikes on the same wall with the controllers alternating: the old one chatters, "
         "the new one does not.",
         f"K = {recorded.settings.wall.stiffness_nm_per_rad:g} N·m/rad at "
-        f"{1.0 / recorded.settings.bus.cycle_s:g} Hz; " + "; ".join(described) + ".",
+        f"{1.0 / recorded.settings.bus.cycle_s:g} Hz; " + "; ".join(findings) + ".",
         {
             "t [s]": t,
             "y [mrad]": y * 1e3,
@@ -187,36 +188,36 @@ def _strikes(recorded: Recorded) -> FigurePage:
     )
 
 
-def _efforts(recorded: Recorded) -> FigurePage:
+def _draw_efforts(recorded: RecordedRun) -> FigurePage:
     displayed, other = (stage.wall for stage in recorded.settings.stages[:2])
     box = close_up(recorded)
     stiffness = displayed.stiffness_nm_per_rad
     t, y = recorded.column("t_s")[box], recorded.column("y")[box] * 1e3
-    shown = 0.0 - recorded.column("force_applied")[box] / stiffness * 1e3
+    applied = 0.0 - recorded.column("force_applied")[box] / stiffness * 1e3
     hidden = 0.0 - effort(recorded, other)[box] / stiffness * 1e3
     title = "Figure 5.19: close-up, with the effort of both controllers"
     figure, axes = blank(title, "time t [s]", "position y, control effort as −f/K [mrad]")
     axes.axhline(0.0, color="k", lw=0.8)
     axes.plot(t, y, ".-", color=REFERENT, lw=0.9, ms=4.0, label="position y")
-    stairs(axes, t, shown, f"{displayed.law}, displayed")
+    stairs(axes, t, applied, f"{displayed.law}, displayed")
     stairs(axes, t, hidden, f"{other.law}, not displayed", color=COLOURS[1], ls="--")
     axes.margins(x=0.01)
     legend_below(figure, axes)
-    met, of = meetings(t, y, hidden)
-    met_shown, of_shown = meetings(t, y, shown)
+    phases, periods = effort_crossing_phases(t, y, hidden)
+    displayed_phases, displayed_periods = effort_crossing_phases(t, y, applied)
     return FigurePage(
         "figure_5_19",
         title,
         "With the stiffness scaled to unity, the new control effort (dashed, not displayed) meets "
         "the position at the half-sample times; the old one (solid, displayed) lags it.",
-        f"{other.law} meets the position in {len(met)} of {of} periods, at {met.mean():.2f} of "
-        f"the period ({met.min():.2f} to {met.max():.2f}); {displayed.law} in {len(met_shown)} of "
-        f"{of_shown}: its force belongs to the sample before, because on the bus it takes effect "
-        "one SYNC later.",
+        f"{other.law} meets the position in {len(phases)} of {periods} periods, at "
+        f"{phases.mean():.2f} of the period ({phases.min():.2f} to {phases.max():.2f}); "
+        f"{displayed.law} in {len(displayed_phases)} of {displayed_periods}: its force belongs to "
+        "the sample before, because on the bus it takes effect one SYNC later.",
         {
             "t [s]": t,
             "y [mrad]": y,
-            f"-f/K {displayed.law} displayed [mrad]": shown,
+            f"-f/K {displayed.law} displayed [mrad]": applied,
             f"-f/K {other.law} not displayed [mrad]": hidden,
         },
         figure,

@@ -1,7 +1,7 @@
-"""The ball of the source's figures, and what is drawn of its motion.
+"""Ball of the source's figures, and the traces drawn of its motion.
 
-One ball for all of them: 1 kg dropped from 12 m onto 1 N/m under 1 m/s², sampled every 0.25 s
-(θ = 0.25): contacts of some 14 periods, few enough for the held force to be seen as stairs.
+All figures use one ball: 1 kg dropped from 12 m onto 1 N/m under 1 m/s², sampled every 0.25 s
+(θ = 0.25). Contacts have about 14 periods, few enough to see the held force as stairs.
 """
 
 from dataclasses import dataclass, replace
@@ -17,24 +17,24 @@ from canwall.workbench.figure_page import REFERENT, RENDERED, SAMPLES, stairs
 Array = NDArray[np.float64]
 
 BALL = Ball(stiffness=1.0, mass=1.0, gravity=1.0, height=12.0, period=0.25)
-#: What the figures of a few bounces cover [s].
+#: Time covered by the figures of a few bounces [s].
 SHORT_S = 45.0
-#: Instants to the period at which the motion is drawn.
+#: Points per period at which the motion is drawn.
 POINTS = 20
 
 #: Labels of the axes.
 TIME, POSITION = "time t [s]", "height y, held force as −f/K [m]"
 
 
-def fall(law: str, seconds: float = SHORT_S, height: float = BALL.height) -> Bounces:
-    """The ball of the figures on a floor rendered by that law."""
+def drop_ball(law: str, seconds: float = SHORT_S, height: float = BALL.height) -> Bounces:
+    """Drop the ball of the figures from a height [m] onto a floor rendered by a law."""
     periods = round(seconds / BALL.period)
     return Bounces.on(replace(BALL, height=height, periods=periods), law)
 
 
 @dataclass(frozen=True)
 class Traces:
-    """What is drawn of a stretch of samples: motion, held force, continuous referent."""
+    """Motion, held force and continuous referent over a range of samples."""
 
     t: Array
     y: Array
@@ -44,7 +44,7 @@ class Traces:
 
     @classmethod
     def of(cls, bounces: Bounces, samples: slice | None = None) -> "Traces":
-        """Of the samples from samples.start to samples.stop, both with; or of all."""
+        """Trace the samples from samples.start to samples.stop, both included; None: all."""
         t, y = bounces.between(POINTS)
         fine = slice(None)
         if samples is not None:
@@ -55,22 +55,22 @@ class Traces:
         return cls(t[fine], y[fine], force[fine], referent[fine], at_sample[fine])
 
     def columns(self) -> dict[str, Array | NDArray[np.int64]]:
-        """For the CSV."""
+        """Return the columns of the CSV file."""
         return {
             "t [s]": self.t,
             "at a sample [0 or 1]": self.at_sample,
             "y rendered [m]": self.y,
             "y continuous [m]": self.referent,
             "f held [N]": self.force,
-            # Zero without a sign.
+            # 0.0 − 0.0 has no sign.
             "-f/K [m]": 0.0 - self.force / BALL.stiffness,
         }
 
     def draw(self, axes: Axes, samples: bool) -> None:
-        """Referent dashed, rendered motion solid, force as stairs; where wanted its samples."""
+        """Draw referent, rendered motion and force, with the samples if asked for."""
         axes.axhline(0.0, color="k", lw=0.8)
         axes.plot(self.t, self.y, color=RENDERED, lw=2.4, label="sampled-data floor")
-        # Dashed over solid: where the two agree, both are to be seen.
+        # Dashed over solid, so that both are visible where they agree.
         axes.plot(self.t, self.referent, color=REFERENT, lw=1.0, ls="--", label="continuous floor")
         if samples:
             at = self.at_sample == 1
@@ -80,5 +80,5 @@ class Traces:
 
 
 def around(contact: slice) -> slice:
-    """A contact with a few samples of flight on either side."""
+    """Return a contact with a few samples of flight on either side."""
     return slice(contact.start - 3, contact.stop + 2)

@@ -15,7 +15,7 @@ from canwall.record import ROW
 from canwall.run.closed_loop import ClosedLoop, simulate_wall
 from canwall.sweep import make_plan
 from canwall.sweep.plan import Plan
-from canwall.sweep.workers import computed
+from canwall.sweep.workers import compute_pieces
 
 #: Periods of one strike.
 _STRIKE = 1000
@@ -117,15 +117,15 @@ def sweep_on_two_cores() -> dict[str, Any]:
         press=1.1,
     )
     pieces = range(plan.pieces)
-    list(computed(plan, pieces[:2], 1))
+    list(compute_pieces(plan, pieces[:2], 1))
     _spin(10)
     bare = [_seconds(lambda cores=cores: _spun(cores), 3) for cores in (1, 2)]  # type: ignore[misc]
-    one = _seconds(lambda: list(computed(plan, pieces, 1)), 3)
-    two = _seconds(lambda: list(computed(plan, pieces, 2)), 3)
+    one = _seconds(lambda: list(compute_pieces(plan, pieces, 1)), 3)
+    two = _seconds(lambda: list(compute_pieces(plan, pieces, 2)), 3)
     return {
-        "points": plan.points_in_all,
+        "points": plan.point_count,
         "periods": round(
-            plan.points_in_all * plan.settings(plan.points[0], plan.strikes[1]).run.duration_s * 1e3  # type: ignore[operator]
+            plan.point_count * plan.settings(plan.points[0], plan.strikes[1]).run.duration_s * 1e3  # type: ignore[operator]
         ),
         "one_core_s": round(one, 2),
         "two_cores_s": round(two, 2),

@@ -15,8 +15,8 @@ import canwall.run
 from canwall import config, simdrive
 from canwall.bench import latency as latency_module
 from canwall.bench.budget import Budget, BudgetFrame, bus_budget
-from canwall.bench.latency import Histogram, Latency, LatencyPart, measure_latency, shortest_cycle
-from canwall.bench.latency_report import QUANTITIES, lines, percentiles_us, write_latency
+from canwall.bench.latency import Histogram, Latency, LatencyPhase, measure_latency, shortest_cycle
+from canwall.bench.latency_report import QUANTITIES, percentiles_us, report_lines, write_latency
 from canwall.config import Settings
 from canwall.cycle import HISTOGRAM, Grant, observe_ns
 from canwall.errors import InputError, RunFailedError
@@ -111,7 +111,7 @@ def test_stopped_in_between(drives: list[Listening]) -> None:
     assert {data for can_id, data in listening.heard if can_id == 0x205} == {bytes(4)}
 
 
-# The shortest_cycle
+# The shortest cycle
 
 
 def histogram(*values_us: float) -> Histogram:
@@ -121,9 +121,9 @@ def histogram(*values_us: float) -> Histogram:
     return Histogram.of(counted)
 
 
-def phase(name: str, sync_to_rpdo_us: float, missed: int = 0) -> LatencyPart:
+def phase(name: str, sync_to_rpdo_us: float, missed: int = 0) -> LatencyPhase:
     many = [histogram(*[value] * 1000) for value in (5.0, 10.0, sync_to_rpdo_us)]
-    return LatencyPart(name, 1000, missed, 0, *many)
+    return LatencyPhase(name, 1000, missed, 0, *many)
 
 
 def budget(settings: Settings) -> Budget:
@@ -146,7 +146,7 @@ def test_bus_that_bounds_the_cycle() -> None:
     assert found.by_bus_s == pytest.approx(bits / 125e3 / 0.8, rel=0.01)
     assert found.holds_s == math.ceil(found.by_bus_s * 1e5) / 1e5
     assert found.text.startswith("holds a cycle of 2.8")
-    assert "bound by the bus: a cycle has 285 bits, and 80% of 125 kbit/s" in found.text
+    assert "limited by the bus: a cycle has 285 bits, and 80% of 125 kbit/s" in found.text
 
 
 def test_machine_that_bounds_the_cycle() -> None:
@@ -157,7 +157,7 @@ def test_machine_that_bounds_the_cycle() -> None:
     )
     assert found.by_machine_s == pytest.approx(700e-6 + 95e-6, rel=1 / 32)
     assert found.holds_s >= found.by_machine_s
-    assert "(under load), most of it until the TPDO comes, without real-time priority" in found.text
+    assert "(under load), most of it waiting for the TPDO, without real-time priority" in found.text
 
 
 def test_bus_without_a_bit_rate_has_the_time_of_a_wire_added() -> None:
@@ -185,7 +185,7 @@ def test_cycle_that_is_too_short() -> None:
 def measured() -> Latency:
     settings = bench_settings()
     counted = [
-        LatencyPart(
+        LatencyPhase(
             name,
             4,
             0,
@@ -214,7 +214,7 @@ def measured() -> Latency:
 
 
 def test_histograms_as_text() -> None:
-    text = list(lines(measured()))
+    text = list(report_lines(measured()))
     error = [line.split() for line in text if line.startswith("       2 – 5")]
     assert [word for word in error[0] if word.isdigit()][2:] == ["3", "2"]  # of idle, of load
     # What is late has no margin left; it is in the same bins, from the next SYNC backwards.
@@ -271,7 +271,7 @@ def test_command_over_unixcan(start: Start, tmp_path: Path) -> None:
         *("latency", file, "--duration", "0.2", "--load", "1", "--output", tmp_path / "out")
     )
     assert (done.returncode, done.stderr) == (0, "")
-    assert "exchange native; the drive is set up, not enabled" in done.stdout
+    assert "exchange native; the drive is set up but not enabled" in done.stdout
     assert done.stdout.splitlines()[-1].startswith(("holds", "does not hold", "not even"))
     assert (tmp_path / "out" / "latency.png").exists()
 
@@ -299,4 +299,4 @@ def test_ctrl_c(start: Start) -> None:
     running.send_signal(2)
     _, errors = running.communicate(timeout=60.0)
     assert running.returncode == 130
-    assert errors.splitlines() == ["canwall: interrupted; the drive is as it was"]
+    assert errors.splitlines() == ["canwall: interrupted; the drive is as it was before"]

@@ -50,11 +50,11 @@ def test_download_and_back(make_rig: RigFactory, dcf: Path) -> None:
 
 @pytest.mark.parametrize("name", ["6072", "0x6072:", "0x60720010", "max_torque"])
 def test_parameter_that_names_no_object(name: str) -> None:
-    with pytest.raises(ConfigError, match=r"drive.parameters: .* names no object"):
+    with pytest.raises(ConfigError, match=r"drive.parameters: .* is not an object"):
         settings_with({"drive.parameters": {name: 1}})
 
 
 def test_parameter_that_has_no_room(make_rig: RigFactory) -> None:
     rig = make_rig(settings_with({"drive.parameters": {"0x6072": 70000}}))
-    with pytest.raises(Exception, match="0x6072:00: 0x11170 has no room in it"):
+    with pytest.raises(Exception, match="0x6072:00: 0x11170 does not fit into it"):
         rig.set_up()

@@ -22,7 +22,12 @@ def rig_with(make_rig: RigFactory, mode: str = "auto", supported: int | None = N
         ("auto", 0x208, CST, "0x6502 = 0x208 lists it"),
         ("auto", 0x200, CST, "0x6502 = 0x200 lists it"),
         ("auto", 0x008, PT, "0x6502 = 0x8 lists it, and not cyclic synchronous torque"),
-        ("auto", 0x1F0065, CST, "0x6502 = 0x1f0065 lists no torque mode, yet the drive took it"),
+        (
+            "auto",
+            0x1F0065,
+            CST,
+            "0x6502 = 0x1f0065 lists no torque mode, yet the drive accepted it",
+        ),
         ("cst", 0x008, CST, 'drive.mode = "cst"; 0x6502 = 0x8 does not list it, yet the drive'),
         ("pt", 0x208, PT, 'drive.mode = "pt"; 0x6502 = 0x208 lists it'),
     ],
@@ -41,7 +46,7 @@ def test_without_0x6502_the_mode_is_tried(make_rig: RigFactory) -> None:
     rig = rig_with(make_rig)
     del rig.node.dictionary[0x6502]
     setup = rig.set_up()
-    assert "there is no 0x6502; the drive took the mode when it was tried" in str(setup.mode)
+    assert "there is no 0x6502; the drive accepted the mode when it was tried" in str(setup.mode)
 
 
 def test_mode_that_is_listed_but_does_not_come_leaves_profile_torque(make_rig: RigFactory) -> None:

@@ -65,7 +65,7 @@ def test_feed_constant(rig: Rig, feed: tuple[int, int], counts: float) -> None:
 
 def test_encoder_of_one_is_none(rig: Rig) -> None:
     rig.tampering.lies |= {(0x608F, 1): 1, (0x608F, 2): 1}
-    with pytest.raises(DriveError, match=r"1/1 is no encoder; give drive.counts_per_rev"):
+    with pytest.raises(DriveError, match=r"1/1 is not an encoder; give drive.counts_per_rev"):
         rig.set_up()
 
 

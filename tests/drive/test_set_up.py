@@ -173,7 +173,7 @@ def test_no_gear_ratio_is_a_ratio_of_one(rig: Rig) -> None:
 @pytest.mark.parametrize("lie", [{(0x608F, 1): 0}, {(0x6091, 2): 0}])
 def test_scale_of_zero(rig: Rig, lie: dict[Object, int]) -> None:
     rig.tampering.lies |= lie
-    assert "is no scale" in error_of(rig)
+    assert "is not a scale" in error_of(rig)
 
 
 def test_rated_torque_of_zero(rig: Rig) -> None:

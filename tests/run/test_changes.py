@@ -14,7 +14,7 @@ from rig import SIM_CONFIG, Loop, RigFactory, settings_with
 from canwall.config import ConfigError
 from canwall.errors import RunFailedError
 from canwall.record import Mailbox, RunFolder, read_signals
-from canwall.run.changes import change, open_to_changes
+from canwall.run.changes import open_to_changes, post_change
 
 PATIENCE_S = 60.0
 
@@ -68,7 +68,7 @@ def test_change_is_in_force_from_the_cycle_that_it_is_told(
     senders: list[threading.Thread] = []
 
     def post(assignments: list[str]) -> None:
-        told.append(change(folder, assignments))
+        told.append(post_change(folder, assignments))
 
     def at(j: int) -> bool:
         if j in (300, 600):
@@ -124,7 +124,7 @@ def test_run_of_the_command_is_changed_by_the_command(start: Start, tmp_path: Pa
         ("limits.torque=1", "limits.torque: unknown key; did you mean torque_nm?"),
         ("position_rad=7", "position_rad = 7 lies outside the run's limits.position_rad"),
         ("law=nothing", "law: unknown law 'nothing'"),
-        ("law=midpoint", "law midpoint is none of the run's: standard, half_sample; list it"),
+        ("law=midpoint", "law midpoint is not one of the run's: standard, half_sample; list it"),
     ],
 )
 def test_impossible_change_is_not_posted(tmp_path: Path, assignment: str, message: str) -> None:
@@ -133,7 +133,7 @@ def test_impossible_change_is_not_posted(tmp_path: Path, assignment: str, messag
     mailbox = Mailbox.create()
     folder.live.write_text(json.dumps({"mailbox": mailbox.address}))
     with pytest.raises(ConfigError) as error:
-        change(folder, [assignment])
+        post_change(folder, [assignment])
     assert str(error.value).startswith(message)
     assert not mailbox.waiting()
     mailbox.close()
@@ -141,12 +141,12 @@ def test_impossible_change_is_not_posted(tmp_path: Path, assignment: str, messag
 
 def test_run_that_is_over_takes_no_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = RunFolder(tmp_path)
-    with pytest.raises(ConfigError, match="no run goes on here"):
-        change(folder, ["stiffness_nm_per_rad=1"])
+    with pytest.raises(ConfigError, match="no run in progress"):
+        post_change(folder, ["stiffness_nm_per_rad=1"])
     folder.config.write_text(settings_with().to_toml())
     mailbox = Mailbox.create()
     folder.live.write_text(json.dumps({"mailbox": mailbox.address}))
     monkeypatch.setattr("canwall.run.changes._PATIENCE_S", 0.01)
     with pytest.raises(RunFailedError, match="does not take the change"):
-        change(folder, ["stiffness_nm_per_rad=1"])
+        post_change(folder, ["stiffness_nm_per_rad=1"])
     mailbox.close()

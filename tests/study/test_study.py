@@ -1,39 +1,38 @@
-"""Sweeps with a person at the handle, who is a script here: prompts, ways to end, verdicts."""
+"""`canwall study` with a script for the person: prompts, ways to end, verdicts."""
 
 import csv
 import os
 import re
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import PATIENCE_S, Record, torque_is_on, wait_for
+from commands import COMMAND, PATIENCE_S, Record, torque_is_on, wait_for
 from hypothesis import example, given
 from hypothesis import strategies as st
 from rig import SIM_CONFIG
 
 from canwall.errors import InputError
 from canwall.study.session import Verdict
-from canwall.study.staircase import Staircase, limits
+from canwall.study.staircase import Staircase, stiffness_limits
 from canwall.study.terminal import SessionEndedError, Terminal
 
-SCRIPT = SIM_CONFIG.parents[1] / "scripts" / "by_hand.py"
 BEGINS, STRUCK = "Enter begins, q ends: ", "y, n, again: "
 #: The simulated hand strikes once a second.
 ONE, TWO, FOR_EVER = 1.0, 2.0, 1e6
 
 
 class Person:
-    """Somebody who reads the prompts and answers them."""
+    """A study in a process of its own: reads its prompts and answers them."""
 
-    def __init__(self, what: str, folder: Path, *arguments: object) -> None:
+    def __init__(self, study: str, folder: Path, *arguments: object) -> None:
         self.folder = folder
+        options = ["--output", folder, *map(str, arguments)]
         self.process = subprocess.Popen(
-            [sys.executable, SCRIPT, what, SIM_CONFIG, "--output", folder, *map(str, arguments)],
+            [COMMAND, "study", study, SIM_CONFIG, *options],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -41,7 +40,7 @@ class Person:
         )
 
     def read_to(self, *prompts: str) -> str:
-        """What is said up to one of the prompts, or to the end."""
+        """Everything printed up to one of the prompts, or to the end."""
         assert self.process.stdout is not None
         said = ""
         while not said.endswith(prompts):
@@ -285,8 +284,8 @@ def test_limits_are_the_stiffest_free_and_the_softest_that_is_not() -> None:
         return Verdict(1, "", law, stiffness, 1, free, False, "", 0.0, 0.0, "")
 
     said = [verdict("a", 5, True), verdict("a", 20, False), verdict("a", 10, True)]
-    assert limits([*said, verdict("b", 5, False)]) == {"a": (10, 20), "b": (0.0, 5)}
-    assert limits([]) == {}
+    assert stiffness_limits([*said, verdict("b", 5, False)]) == {"a": (10, 20), "b": (0.0, 5)}
+    assert stiffness_limits([]) == {}
 
 
 @pytest.mark.parametrize(
@@ -315,7 +314,7 @@ def test_what_was_typed_before_is_no_answer(keyboard: tuple[Terminal, Any]) -> N
     terminal, keys = keyboard
     keys.write("y\n\nq\nhalf a line")
     terminal.discard_input()
-    assert terminal.pressed() is None
+    assert terminal.poll_line() is None
     keys.write("N \n")
     assert terminal.ask("?", ("y", "n")) == "n"
 
@@ -323,14 +322,14 @@ def test_what_was_typed_before_is_no_answer(keyboard: tuple[Terminal, Any]) -> N
 def test_lines_while_a_wall_is_rendered(
     keyboard: tuple[Terminal, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("canwall.study.terminal._LOOKS_S", 0.0)
+    monkeypatch.setattr("canwall.study.terminal._POLL_INTERVAL_S", 0.0)
     terminal, keys = keyboard
-    assert terminal.pressed() is None
+    assert terminal.poll_line() is None
     keys.write("q")
-    assert terminal.pressed() is None
+    assert terminal.poll_line() is None
     keys.write("\n\n")
-    assert [terminal.pressed(), terminal.pressed(), terminal.pressed()] == ["q", "", None]
+    assert [terminal.poll_line(), terminal.poll_line(), terminal.poll_line()] == ["q", "", None]
     keys.close()
-    assert [terminal.pressed(), terminal.pressed()] == ["q", "q"]
+    assert [terminal.poll_line(), terminal.poll_line()] == ["q", "q"]
     with pytest.raises(SessionEndedError):
         terminal.ask("?", ("",))

@@ -17,8 +17,8 @@ from canwall.analysis.analytic_limits import (
     stable_stiffness,
 )
 from canwall.sweep import make_plan
-from canwall.sweep.dataset import gathered
-from canwall.sweep.plan import compute
+from canwall.sweep.dataset import assemble_dataset
+from canwall.sweep.plan import compute_piece
 
 MASS, PERIOD = 1e-4, 1e-3
 UNIT = MASS / PERIOD**2
@@ -42,7 +42,9 @@ LAID = {
 
 def found(**axes: Any) -> xr.Dataset:
     plan = make_plan(settings_with(), axes)
-    return gathered(plan, {piece: compute(plan, piece) for piece in range(plan.pieces)})
+    return assemble_dataset(
+        plan, {piece: compute_piece(plan, piece) for piece in range(plan.pieces)}
+    )
 
 
 def swings(dataset: xr.Dataset) -> Any:

@@ -165,10 +165,10 @@ import logging
 from pathlib import Path
 from canwall.config import load
 from canwall.sweep import make_plan
-from canwall.sweep.workers import computed
+from canwall.sweep.workers import compute_pieces
 plan = make_plan(load(Path({str(SIM_CONFIG)!r})), {{"stiffness": "1,2"}})
 pieces = range(plan.pieces)
-assert len(list(computed(plan, pieces, dask={cluster.address!r}))) == plan.pieces
+assert len(list(compute_pieces(plan, pieces, dask={cluster.address!r}))) == plan.pieces
 for name in list(logging.root.manager.loggerDict):
     if name.startswith("distributed"):
         logging.getLogger(name).warning("this one")
@@ -185,7 +185,7 @@ def test_lost_scheduler_ends_the_sweep_and_resume_goes_on(
         process = begun(output, "--dask", cluster.address)
         cluster.scheduler.kill()
     _, errors = process.communicate(timeout=PATIENCE_S)
-    line = f"--dask {cluster.address}: the scheduler is gone; --resume goes on with {output}"
+    line = f"--dask {cluster.address}: the scheduler is gone; --resume continues {output}"
     assert (process.returncode, errors) == (1, f"canwall: {line}\n")
     assert_resume_goes_on(output, whole)
 
@@ -204,7 +204,7 @@ def none_at_all(folder: Path) -> None:
     ("made", "line"),
     [
         (another_version, "a worker has canwall 0.0.1; needed: canwall "),
-        (none_at_all, "need the canwall that is here: this machine has no canwall"),
+        (none_at_all, "need the canwall of this machine: this machine has no canwall"),
     ],
 )
 def test_cluster_with_other_software_computes_nothing(
@@ -228,7 +228,7 @@ def test_what_was_interrupted_goes_on(whole: Path, tmp_path: Path, end: signal.S
     _, errors = process.communicate(timeout=PATIENCE_S)
     if end == signal.SIGINT:
         assert process.returncode == 130
-        assert errors == f"canwall: interrupted; --resume goes on with {output}\n"
+        assert errors == f"canwall: interrupted; --resume continues {output}\n"
     assert not output.exists()
     assert command(*SWEEP, "--output", output).returncode == 2
     assert_resume_goes_on(output, whole)

@@ -5,7 +5,7 @@ from rig import settings_with
 
 from canwall.cycle import Trip
 from canwall.sweep import make_plan
-from canwall.sweep.plan import compute
+from canwall.sweep.plan import compute_piece
 
 
 @pytest.mark.parametrize("operator", ["none", "finger"])
@@ -24,4 +24,4 @@ def test_handle_that_friction_stops_is_no_stuck_encoder(law: str, operator: str)
         },
     )
     for piece in range(plan.pieces):
-        assert Trip.STUCK not in compute(plan, piece)["trip"]
+        assert Trip.STUCK not in compute_piece(plan, piece)["trip"]

@@ -14,10 +14,10 @@ from rig import settings_with
 
 from canwall import cli
 from canwall.errors import InputError
-from canwall.sweep import Plan, make_plan, read_sweep, sweep, sweep_table, without_effect
+from canwall.sweep import Plan, ineffective_axis_notes, make_plan, read_sweep, sweep, sweep_table
 from canwall.sweep.journal import Journal
-from canwall.sweep.plan import compute
-from canwall.sweep.workers import computed
+from canwall.sweep.plan import compute_piece
+from canwall.sweep.workers import compute_pieces
 
 SMALL = {"speed": [1.0], "phase": [0.35]}
 
@@ -27,7 +27,7 @@ def plan_of(through: str = "sim", **axes: object) -> Plan:
 
 
 def raw(plan: Plan) -> list[bytes]:
-    return [compute(plan, piece).tobytes() for piece in range(plan.pieces)]
+    return [compute_piece(plan, piece).tobytes() for piece in range(plan.pieces)]
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_a_map_has_every_axis_with_its_unit(tmp_path: Path) -> None:
     point = {"law": "standard", "rate": 1000, "simulation.coulomb_nm": 0.01}
     alone = plan_of(stiffness=[10.0**1.5], damping=[0.01], speed=[1.0], **point)
     there = read.sel({**point, "damping": 0.01, "speed": 1.0}).isel(stiffness=3)
-    (measured,) = compute(alone, 0)[0]
+    (measured,) = compute_piece(alone, 0)[0]
     assert there["energy_out"].item() == pytest.approx(measured["energy_out"], rel=1e-9)
     assert there["peak_torque"].item() == pytest.approx(measured["peak_torque"], rel=1e-9)
 
@@ -91,13 +91,13 @@ def test_the_result_does_not_depend_on_the_workers(tmp_path: Path) -> None:
     assert one.identical(three)
     by_frames = plan_of("bus", law=["standard"], operator=["none"], stiffness="1:50:2")
     in_memory = plan_of(law=["standard"], operator=["none"], stiffness="1:50:2")
-    ((_, framed),) = computed(by_frames, [0], workers=2)
-    assert framed.tobytes() == compute(in_memory, 0).tobytes()
+    ((_, framed),) = compute_pieces(by_frames, [0], workers=2)
+    assert framed.tobytes() == compute_piece(in_memory, 0).tobytes()
 
 
 def test_a_k_limit_is_free_and_a_little_more_is_not() -> None:
     plan = plan_of(law=["half_sample"], operator=["finger"], speed=[0.5, 2.0], phase=[0.0, 0.7])
-    found = compute(plan, 0)
+    found = compute_piece(plan, 0)
     worst = found["worst"][0, 0]
     assert worst <= found["limit"].min()
     free = plan_of(
@@ -107,7 +107,7 @@ def test_a_k_limit_is_free_and_a_little_more_is_not() -> None:
         phase=[0.0, 0.7],
         stiffness=[worst, found["limit"].min() * 1.011],
     )
-    chatters = np.array([compute(free, piece)["chatters"][0] for piece in range(free.pieces)])
+    chatters = np.array([compute_piece(free, piece)["chatters"][0] for piece in range(free.pieces)])
     assert not chatters[:, 0].any()
     assert chatters[:, 1].any()
 
@@ -156,12 +156,12 @@ def test_a_journal_cut_short_by_a_power_cut_keeps_what_is_whole(tmp_path: Path) 
     output = tmp_path / "a.nc"
     plan = plan_of(stiffness="1:100:3")
     journal = Journal(output, "plan", resume=False)
-    journal.put(0, compute(plan, 0))
+    journal.put(0, compute_piece(plan, 0))
     # No close: the process is gone.
-    journal._base.close()
+    journal._database.close()
     again = Journal(output, "plan", resume=True)
     assert again.done() == [0]
-    assert again.get(0, plan.dtype).tobytes() == compute(plan, 0).tobytes()
+    assert again.get(0, plan.dtype).tobytes() == compute_piece(plan, 0).tobytes()
     again.remove()
 
 
@@ -170,19 +170,19 @@ def test_a_journal_cut_short_by_a_power_cut_keeps_what_is_whole(tmp_path: Path) 
     [
         ({"stiffness": "1:2"}, "axis stiffness: has to be a number, not '1:2'"),
         ({"stiffness": "0:2:3"}, "a geometric range has to be above 0"),
-        ({"stiffness": "1:2:0"}, "is no range; write LO:HI:N"),
-        ({"stiffness": "1,1"}, "a value is there twice"),
+        ({"stiffness": "1:2:0"}, "is not a range; write LO:HI:N"),
+        ({"stiffness": "1,1"}, "axis stiffness: has a value twice"),
         ({"stiffness": ""}, "axis stiffness: has no values"),
-        ({"operator": "giant"}, "no 'giant'; there are none, finger"),
-        ({"model": "none"}, "no 'none'; there are matched"),
+        ({"operator": "giant"}, "has to be one of none, finger, grip, hand, not 'giant'"),
+        ({"model": "none"}, "has to be one of matched, drive, file, not 'none'"),
         ({"rate": "0"}, "axis rate: has to be greater than 0"),
         ({"simulation.coulomb": "1"}, "simulation.coulomb: unknown key; did you mean"),
         ({"simulation.coulomb_nm": "-1"}, "simulation.coulomb_nm: has to be greater than"),
         ({"simulation.coulomb_nm": "0,red"}, "simulation.coulomb_nm: has to be a valid number"),
         ({"nothing.at_all": "1"}, "nothing.at_all: there is no"),
         ({"law": "none"}, "wall.law: unknown law 'none'"),
-        ({"wall.stiffness_nm_per_rad": "1"}, "is called stiffness here"),
-        ({"delay": "3.5"}, "axis delay: has to be 3 at most"),
+        ({"wall.stiffness_nm_per_rad": "1"}, "use stiffness instead"),
+        ({"delay": "3.5"}, "axis delay: has to be at most 3"),
         ({"damping": "-1"}, "axis damping: has to be at least 0, not -1"),
         ({"rate": "1e8"}, "a strike of .* cycles; 2000000 at most"),
         ({"press": "1e9"}, "a strike of .* cycles; 2000000 at most"),
@@ -307,11 +307,14 @@ def test_a_map_is_shown_in_a_table() -> None:
 
 
 @pytest.mark.parametrize("stiffness", [{}, {"stiffness": "2,20"}])
-def test_axis_that_a_law_has_no_use_for_is_told(tmp_path: Path, stiffness: dict[str, str]) -> None:
+def test_notes_on_axes_that_a_law_ignores(tmp_path: Path, stiffness: dict[str, str]) -> None:
     axes = {"law": ["standard", "damped", "rigid"], "damping": "0,0.02", "speed": "1", "phase": "0"}
     dataset = sweep(make_plan(settings_with(), axes | stiffness), tmp_path / "a.nc")
     of_stiffness = ["stiffness changes nothing for rigid"] if stiffness else []
-    assert without_effect(dataset) == [*of_stiffness, "damping changes nothing for standard, rigid"]
+    assert ineffective_axis_notes(dataset) == [
+        *of_stiffness,
+        "damping changes nothing for standard, rigid",
+    ]
     limits = list(sweep_table(dataset).columns[2].cells)
     assert [cell.startswith("≥") for cell in limits] == [
         not stiffness and n >= 4 for n in range(len(limits))

@@ -134,8 +134,8 @@ def test_limits_of_one_condition_and_what_cannot_be_drawn(tmp_path: Path) -> Non
     ("content", "line"),
     [
         (None, "no such file"),
-        (b"", "no result of a sweep"),
-        (b"no result", "no result of a sweep"),
+        (b"", "not the result of a sweep"),
+        (b"no result", "not the result of a sweep"),
     ],
 )
 def test_a_file_that_is_no_sweep(tmp_path: Path, content: bytes | None, line: str) -> None:

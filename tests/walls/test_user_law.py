@@ -14,7 +14,7 @@ from rig import SIM_CONFIG
 
 from canwall.record import Phase
 from canwall.walls import LAWS, WALL, UnknownLawError, find_law, set_plant, set_referent, wall_force
-from canwall.workbench import Ball, bounced, sampled_ball
+from canwall.workbench import Ball, sampled_ball, simulate_ball
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "my_law.py"
 
@@ -60,7 +60,7 @@ def test_example_is_its_formula(example: str) -> None:
 
 
 def test_example_without_growth_is_the_clamped_midpoint(example: str) -> None:
-    own = bounced(Ball(stiffness=4.0), example, options={"growth": 0.0})
+    own = simulate_ball(Ball(stiffness=4.0), example, options={"growth": 0.0})
     midpoint = sampled_ball(Ball(stiffness=4.0, tension="clamp"), LAWS["midpoint"])
     for mine, theirs in zip(own, midpoint, strict=True):
         assert mine[:100] == pytest.approx(theirs[:100], rel=1e-9, abs=1e-9)
@@ -144,7 +144,7 @@ def test_helpers_constants_memory_and_plain_integers(write: Write) -> None:
         "        return 0\n"
         "    return limited(-wall.stiffness * wall.y) + 0.001 * wall.memory[0]\n"
     )
-    y, _, force = bounced(Ball(periods=100), law)
+    y, _, force = simulate_ball(Ball(periods=100), law)
     calls = 0.001 * (np.arange(100) + 1.0)
     expected = np.where(y < 0.0, np.minimum(-y, 0.5), 0.0)[:-1] + np.where(y[:-1] < 0.0, calls, 0.0)
     np.testing.assert_allclose(force[:-1], expected, rtol=1e-12, atol=0.0)

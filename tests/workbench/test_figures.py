@@ -18,13 +18,13 @@ from canwall import cli
 from canwall.analysis import metrics
 from canwall.errors import InputError, RunFailedError
 from canwall.walls import LAWS
-from canwall.workbench import CONTINUOUS, Ball, bounced, continuous_ball, on_the_drive
+from canwall.workbench import CONTINUOUS, Ball, continuous_ball, on_the_drive, simulate_ball
 from canwall.workbench import figures as figures_module
 from canwall.workbench.bounces import Bounces, entering
-from canwall.workbench.comparison import DAMPING, GROUPS, continuous
+from canwall.workbench.comparison import DAMPING, GROUPS, continuous_result
 from canwall.workbench.figures import Extent, write_figures
-from canwall.workbench.on_the_drive import effort, recorded_run
-from canwall.workbench.traces import BALL, POINTS, fall
+from canwall.workbench.on_the_drive import effort, record_run
+from canwall.workbench.traces import BALL, POINTS, drop_ball
 
 Array = NDArray[np.float64]
 
@@ -125,7 +125,7 @@ def test_data_are_the_balls(written: Written, name: str, law: str) -> None:
     at = written.column(name, "at a sample [0 or 1]") == 1.0
     ball = replace(BALL, periods=int(at.sum()) - 1)
     assert ball.periods * ball.period == 45.0
-    y_ball, v_ball, f_ball = bounced(ball, law)
+    y_ball, v_ball, f_ball = simulate_ball(ball, law)
     np.testing.assert_array_equal(t[at], np.arange(ball.periods + 1) * ball.period)
     np.testing.assert_allclose(y[at], y_ball, rtol=0.0, atol=1e-12)
     np.testing.assert_array_equal(f[at], f_ball)
@@ -161,7 +161,7 @@ def test_close_ups_are_parts_of_their_figures(written: Written, close_up: str, w
 
 
 def test_loop_of_figure_5_3_is_the_energy_gained(written: Written) -> None:
-    y, v, _ = bounced(replace(BALL, periods=60), "standard")
+    y, v, _ = simulate_ball(replace(BALL, periods=60), "standard")
     energy = BALL.energy(y, v)
     gained = energy[np.flatnonzero(y < 0.0).max() + 1] - energy[0]
     area, share = written.numbers("figure_5_03", r"area is ([\d.]+) J, ([\d.]+)%")
@@ -182,7 +182,7 @@ def test_delays_of_figure_5_4(written: Written) -> None:
     # The threshold is met after √(2·12) s; the sample after that one is the first inside.
     met = math.sqrt(2.0 * BALL.height / BALL.gravity)
     assert on_s == pytest.approx(-met % BALL.period, abs=5e-5)
-    y, v, f = bounced(replace(BALL, periods=60), "standard")
+    y, v, f = simulate_ball(replace(BALL, periods=60), "standard")
     last = int(np.flatnonzero(y < 0.0).max())
     a = f[last] - 1.0
     crossing = (-v[last] + math.sqrt(v[last] ** 2 - 2.0 * a * y[last])) / a
@@ -190,7 +190,7 @@ def test_delays_of_figure_5_4(written: Written) -> None:
 
 
 def test_pull_of_figure_5_11(written: Written) -> None:
-    y, _, f = bounced(replace(BALL, periods=180), "half_sample")
+    y, _, f = simulate_ball(replace(BALL, periods=180), "half_sample")
     last = int(np.argmin(f))
     pull, taken = written.numbers("figure_5_11", r"pulls with ([\d.]+) N and takes ([\d.]+) J")
     assert pull == pytest.approx(-f[last], abs=5e-4)
@@ -201,7 +201,7 @@ def test_pull_of_figure_5_11(written: Written) -> None:
 
 def test_heights_of_figure_5_12(written: Written) -> None:
     ball = replace(BALL, periods=round(EXTENT.long_s / BALL.period))
-    y, v, f = bounced(ball, "half_sample")
+    y, v, f = simulate_ball(ball, "half_sample")
     flying = (y >= 0.0) & (f == 0.0)
     flying[: int(np.argmin(y >= 0.0))] = False  # the drop itself
     heights = (y + 0.5 * v * v)[flying] / BALL.height
@@ -237,7 +237,7 @@ def test_displayed_effort_of_figure_5_19_belongs_to_the_sample_before(written: W
 
 
 def test_effort_not_displayed_is_the_laws_own() -> None:
-    recorded = recorded_run()
+    recorded = record_run()
     settings = recorded.settings
     laws = np.array(recorded.signals["law"].to_pylist())
     displayed = recorded.column("force_applied")
@@ -263,7 +263,7 @@ def test_run_that_did_not_reach_its_end_draws_nothing(
     result = SimpleNamespace(outcome=outcome, notes=[])
     monkeypatch.setattr(on_the_drive, "run", lambda settings, folder: result)
     with pytest.raises(error, match="^" + "; ".join(trips) + "$"):
-        recorded_run()
+        record_run()
 
 
 # All laws
@@ -313,9 +313,9 @@ def test_exact_laws_gain_nothing(written: Written, law: str) -> None:
 
 def test_continuous_floors_that_all_is_compared_with() -> None:
     # Undamped: the depth at which ½·x² = ½·5² + x, no energy lost. Damped: some is.
-    assert continuous(0.0).peak == pytest.approx(1.0 + math.sqrt(26.0), rel=1e-6)
-    assert continuous(0.0).mean == pytest.approx(0.0, abs=1e-12)
-    assert continuous(DAMPING).mean < -0.5
+    assert continuous_result(0.0).peak == pytest.approx(1.0 + math.sqrt(26.0), rel=1e-6)
+    assert continuous_result(0.0).mean == pytest.approx(0.0, abs=1e-12)
+    assert continuous_result(DAMPING).mean < -0.5
 
 
 # What is counted of bounces
@@ -325,22 +325,22 @@ def test_entering_meets_the_floor_when_and_as_fast_as_asked() -> None:
     ball = entering(Ball(viscous=0.3, spring=0.2, gravity=2.0, period=0.5, periods=1), 3.0, 0.6)
     bounces = Bounces(ball, *(np.array([x, 0.0]) for x in (ball.height, ball.speed, 0.0)))
     bounces.y[1] = -1.0
-    assert bounces.passing(0) == pytest.approx(0.3, rel=1e-12)
+    assert bounces.crossing(0) == pytest.approx(0.3, rel=1e-12)
 
 
 @pytest.mark.parametrize("where", ["inside", "at the first sample outside"])
 def test_contacts_that_are_not_known_to_have_ended_do_not_count(where: str) -> None:
-    whole = fall("standard", 45.0)
+    whole = drop_ball("standard", 45.0)
     second = whole.contacts[1]
     end = second.start + 3 if where == "inside" else second.stop - 1
-    cut = fall("standard", end * BALL.period)
+    cut = drop_ball("standard", end * BALL.period)
     assert (cut.y[-1] < 0.0) == (where == "inside")
     assert len(cut.contacts) == 1
     np.testing.assert_array_equal(cut.heights, whole.heights[:2])
 
 
 def test_energy_is_kept_on_the_continuous_floor() -> None:
-    bounces = fall(CONTINUOUS)
+    bounces = drop_ball(CONTINUOUS)
     assert len(bounces.gains) == 3
     np.testing.assert_allclose(bounces.heights, BALL.height, rtol=1e-12)
 
