@@ -8,9 +8,9 @@ _SOURCE = (INDEX, 1)
 
 
 class Reboot(FaultKind):
-    """The drive is without supply for the duration, or for an instant, and boots.
+    """The drive loses its supply for the duration (without one: for an instant), then boots.
 
-    It sends its boot-up message and has its power-on values.
+    It sends its boot-up message and starts from its power-on values.
     """
 
     name = "reboot"
@@ -42,7 +42,7 @@ class Emergency(FaultKind):
 
 
 class DriveFault(FaultKind):
-    """The drive goes through its fault reaction into FAULT with this code.
+    """The drive goes through its fault reaction into FAULT with this error code.
 
     A fault reset ends it.
     """
@@ -56,7 +56,7 @@ class DriveFault(FaultKind):
 
 
 class EncoderJump(FaultKind):
-    """The encoder reads this much more; at the end it jumps back."""
+    """The encoder jumps; at the end it jumps back."""
 
     name = "encoder_jump"
     number = 10
@@ -71,7 +71,7 @@ class EncoderJump(FaultKind):
 
 
 class EncoderStuck(FaultKind):
-    """The encoder reads the same position, and no speed."""
+    """The encoder keeps reading the same position, and no speed."""
 
     name = "encoder_stuck"
     number = 11
@@ -84,7 +84,7 @@ class EncoderStuck(FaultKind):
 
 
 class PartialTorque(FaultKind):
-    """A part of the torque acts, whatever is demanded; 0x6077 shows it, 0x6074 the demand."""
+    """A part of the demanded torque acts; 0x6077 shows it, 0x6074 the demand."""
 
     name = "torque"
     number = 12
@@ -124,9 +124,9 @@ class Undervoltage(FaultKind):
 
 
 class BusOff(FaultKind):
-    """An error frame, then the drive neither sends nor hears.
+    """After an error frame the drive neither sends nor receives.
 
-    It reacts by 0x6007 and 0x1029, and its watchdogs run on. At the end it sends EMCY 0x8140.
+    It reacts by 0x6007 and 0x1029; its watchdogs run on. At the end it sends EMCY 0x8140.
     """
 
     name = "bus_off"

@@ -19,7 +19,7 @@ class Lost(FaultKind):
 
 
 class Late(FaultKind):
-    """Frames come later.
+    """Frames are late.
 
     Those sent come before what the drive sends with that SYNC, those received after that SYNC.
     """
@@ -47,9 +47,9 @@ class Doubled(FaultKind):
 
 
 class Corrupted(FaultKind):
-    """Bits of the data are flipped and nobody notices.
+    """Bits of the data are flipped, unnoticed by the CRC.
 
-    With 0 bits, the CRC notices: an error frame, then the frame again.
+    With 0 bits it notices: an error frame comes, then the frame again.
     """
 
     name = "corrupted"
@@ -69,7 +69,7 @@ class Corrupted(FaultKind):
 
 
 class WrongLength(FaultKind):
-    """Data are cut short, or padded with zeros to at most 8 bytes."""
+    """Data are cut short, or padded with zeros up to 8 bytes."""
 
     name = "wrong_length"
     number = 5
@@ -83,7 +83,7 @@ class WrongLength(FaultKind):
 
 
 class Silence(FaultKind):
-    """The drive sends nothing, but hears everything."""
+    """The drive sends nothing, but receives everything."""
 
     name = "silence"
     number = 6
@@ -91,7 +91,7 @@ class Silence(FaultKind):
 
 
 class Babbling(FaultKind):
-    """Frames with random data go before those of the drive, with `can_id` (0x001 unless given)."""
+    """Frames with random data come before those of the drive, under `can_id` (default 0x001)."""
 
     name = "babbling"
     number = 16

@@ -1,4 +1,4 @@
-"""`[[simulation.fault]]`: what is a fault, and what a configuration says that is none."""
+"""`[[simulation.fault]]`: settings that are a fault, and messages for those that are none."""
 
 import re
 from pathlib import Path
@@ -72,7 +72,7 @@ def test_every_kind_has_its_own_name_and_number() -> None:
 
 
 def row(kind: type[FaultKind]) -> str:
-    """The kind as the users' document has it."""
+    """Return the kind's row in docs/faults.md."""
     assert kind.__doc__ is not None
     amount = ""
     if kind.amount:

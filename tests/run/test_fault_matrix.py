@@ -58,7 +58,7 @@ def cases() -> list[Case]:
 
 
 class Witness:
-    """Reads torque and state of the drive itself, past everything that is wrong with its frames."""
+    """Reads torque and state from the drive itself, past the faults of its frames."""
 
     def __init__(self, drive: simdrive.FaultyDrive) -> None:
         self._drive = drive.drive
@@ -90,7 +90,7 @@ class Witness:
 
 @pytest.fixture
 def witnesses(monkeypatch: pytest.MonkeyPatch) -> list[Witness]:
-    """Of every drive that is simulated."""
+    """One witness for each simulated drive that is made."""
     found: list[Witness] = []
     make = canwall.run.buses.make_simulated_drive
 
@@ -107,7 +107,7 @@ def witnesses(monkeypatch: pytest.MonkeyPatch) -> list[Witness]:
 
 
 def run_with(folder: Path, toml: str, exchange: str) -> int:
-    """`canwall run` in this process; its exit code."""
+    """Run `canwall run` in this process; return its exit code."""
     changes = {
         'exchange = "auto" ': f'exchange = "{exchange}" ',
         "duration_s = 4.2": f"duration_s = {DURATION_S}",
@@ -121,7 +121,7 @@ def run_with(folder: Path, toml: str, exchange: str) -> int:
 
 
 def cycles_with(torque: "np.ndarray[tuple[int], np.dtype[np.int64]]", at: int) -> int:
-    """From the SYNC of the fault on: cycles until there is no torque any more."""
+    """Return the cycles from the SYNC of the fault until the torque is zero for good."""
     last = np.flatnonzero(torque[at:])
     return int(last[-1]) + 1 if len(last) else 0
 
@@ -129,7 +129,7 @@ def cycles_with(torque: "np.ndarray[tuple[int], np.dtype[np.int64]]", at: int) -
 def found_case(
     case: Case, folder: Path, witnesses: list[Witness], errors: Callable[[], str], exchange: str
 ) -> Case:
-    """What really happens."""
+    """Play the case; return it with what the master and the drive did."""
     code = run_with(folder, case.toml, exchange)
     said = [line.removeprefix("canwall: ") for line in errors().splitlines()]
     record = Record(folder / "run")
@@ -156,7 +156,7 @@ def found_case(
 
 
 def assert_whole(record: Record, said: list[str]) -> None:
-    """Every cycle and every frame is in the record, and what ended it as well."""
+    """Assert that every cycle, every frame and what ended the run are in the record."""
     j = record.column("j")
     assert j.tolist() == list(range(record.summary["cycles"]))
     rpdos = [struct.unpack("<Hh", rpdo) for _, rpdo in record.cycles]
@@ -189,7 +189,7 @@ def test_every_fault_at_every_time() -> None:
 
 
 def table() -> str:
-    """The cases as the users' document has them."""
+    """Return the cases as docs/ways_out.md has them."""
     lines = [
         "| fault | when | what the master does or says | torque commanded [cycles] | at the drive "
         "[cycles] | drive in the end | exit code |",
