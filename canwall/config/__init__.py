@@ -7,7 +7,7 @@ is a `ConfigError` of one line: file, key, what is wrong, what to do.
 from canwall.config.drive import Drive
 from canwall.config.fault import AMOUNTS, NUMBERS, ON_FRAMES, Direction, Fault, FaultName
 from canwall.config.hand import Hand, Move, RandomStrikes
-from canwall.config.reading import ConfigError, absolute_law, first_error, load, overridden, shipped
+from canwall.config.reading import absolute_law, first_error, load, overridden, shipped
 from canwall.config.settings import (
     Bus,
     Estimator,
@@ -21,6 +21,7 @@ from canwall.config.settings import (
     WallChange,
 )
 from canwall.config.simulation import Simulation
+from canwall.errors import ConfigError
 
 __all__ = [
     "AMOUNTS",

@@ -10,12 +10,7 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 
 from canwall.config.settings import Settings
-from canwall.errors import InputError
-
-
-class ConfigError(InputError):
-    """A configuration that cannot be used."""
-
+from canwall.errors import ConfigError
 
 # Lengths and forces at a handle of radius r are angles and torques at its shaft: [wall] may be
 # written in either. The exponent of r takes the metric value to the angular one.

@@ -35,6 +35,7 @@ from canwall.cycle.state import CYCLE
 from canwall.cycle.step import step
 from canwall.cycle.sync import SPIN_NS
 from canwall.cycle.timing import HISTOGRAM, observe_ns
+from canwall.record.columns import ROW
 from canwall.record.ring import (
     ERROR,
     EXTENDED,
@@ -42,7 +43,6 @@ from canwall.record.ring import (
     HEADER,
     RECEIVED,
     REMOTE,
-    ROW,
     ROWS,
     put_frame,
     put_row,

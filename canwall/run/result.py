@@ -2,17 +2,18 @@
 
 import json
 from dataclasses import dataclass
-from typing import Any
-
-import pyarrow as pa
+from typing import TYPE_CHECKING, Any
 
 from canwall.config import ConfigError, Settings
 from canwall.cycle import BusMonitor, Exchange, Grant, Outcome, WallAxis, timing_summary
 from canwall.drive import DriveSetup
 from canwall.errors import RunFailedError
-from canwall.record import RecordError, RunFolder, read_signals
+from canwall.record import RecordError, RunFolder, numbers, read_signals
 from canwall.record.summary import summarise
 from canwall.run.referent import referent_positions
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ def result_of(
     """Summary of one axis, and its last cycles where it tripped."""
     settings = axis.settings
     signals = _recorded(folder, [*outcome.trips, *notes])
-    asked_for = (signals[name].to_numpy() for name in ("stiffness", "damping", "wall_position_rad"))
+    asked_for = (numbers(signals, name) for name in ("stiffness", "damping", "wall_position_rad"))
     referent = referent_positions(settings, *asked_for)
     summary = summarise(signals, settings, axis.setup.units, referent)
     summary |= {
@@ -74,7 +75,7 @@ def _by_the_clock(axis: WallAxis, exchange: Exchange) -> dict[str, Any]:
     }
 
 
-def _recorded(folder: RunFolder, troubles: list[str]) -> pa.Table:
+def _recorded(folder: RunFolder, troubles: list[str]) -> "pa.Table":
     """The signals of the run; without any, its troubles are all that is left to say."""
     try:
         signals = read_signals(folder.signals)

@@ -6,10 +6,12 @@ long, and gives it back with the first frame that asks for more, which the drive
 The frames are the same, bit for bit.
 """
 
+import functools
 import math
+from typing import Any
 
 import numpy as np
-from numba import cfunc, types
+from numba import types
 from numpy.typing import NDArray
 
 from canwall.bus.raw_socket import (
@@ -21,7 +23,7 @@ from canwall.bus.raw_socket import (
     receive,
     send,
 )
-from canwall.compiled import Record, compiled
+from canwall.compiled import Record, compiled, compiled_for_c
 from canwall.simdrive.mechanics.servo import SERVO, move_servo
 
 MAX_TPDOS, MAX_FIELDS = 4, 4
@@ -202,12 +204,16 @@ def serve(drives: NDArray[np.void]) -> int:
     return 1
 
 
-@cfunc(types.int64(types.uint64), cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _serve_at(address: int) -> int:
     """`serve`, of the record at an address."""
     return serve(elements(address, 1, CYCLIC))
 
 
+@functools.cache
+def _served() -> Any:
+    return compiled_for_c(_serve_at, types.int64(types.uint64))
+
+
 def serving(record: NDArray[np.void]) -> CFunction:
     """`serve` as a C function, for a record that stays where it is."""
-    return CFunction(int(_serve_at.address), record.ctypes.data)
+    return CFunction(int(_served().address), record.ctypes.data)

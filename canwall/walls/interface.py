@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import cfunc, from_dtype, types
+from numba import from_dtype, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from canwall.compiled import Record, compiled
+from canwall.compiled import Record, compiled, compiled_for_c
 from canwall.physics import PLANT, zoh
 
 #: How many numbers a law may have for options, and for its memory.
@@ -73,7 +73,7 @@ def law(function: Callable[[Any], float], keep: bool = True) -> Any:
     package only: whether it has changed is not watched elsewhere (`compiled`). Returns numba's
     CFunc. Raises numba's TypingError where the function is not within what numba compiles.
     """
-    return cfunc(LAW_SIGNATURE, cache=keep, error_model="numpy")(function)
+    return compiled_for_c(function, LAW_SIGNATURE, keep)
 
 
 @intrinsic
