@@ -1,13 +1,13 @@
 """How this project compiles: one decorator, and one name for a record in compiled code."""
 
 import contextlib
+import functools
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ParamSpec, TypeAlias, TypeVar
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 _P = ParamSpec("_P")
@@ -49,9 +49,74 @@ def _drop_stale_code() -> None:
 _drop_stale_code()
 
 
+@functools.cache
+def _code_on_disk() -> Any:
+    """Numba's cache of machine code, which loads it without getting ready to compile.
+
+    numba fills its registries (and imports scipy.linalg for them) before it looks into the cache.
+    Loading needs none of that but the symbols of its runtime, and numba does it by itself before
+    it compiles: it is half of what a program with everything in the cache would wait for.
+    """
+    from numba.core.caching import FunctionCache
+    from numba.core.runtime import rtsys
+
+    class CodeOnDisk(FunctionCache):  # type: ignore[misc]
+        def load_overload(self, sig: Any, target_context: Any) -> Any:
+            rtsys.initialize(target_context)
+            with self._guard_against_spurious_io_errors():
+                return self._load_overload(sig, target_context)
+
+    return CodeOnDisk
+
+
+class _Compiled:
+    """A function that is compiled when it is first called, by Python or by compiled code.
+
+    numba takes long to import; whoever merely imports a module with such a function in it does
+    not wait for that.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        functools.update_wrapper(self, function)
+        self._function = function
+
+    def __call__(self, *args: Any) -> Any:
+        return self._dispatcher(*args)
+
+    @functools.cached_property
+    def _dispatcher(self) -> Any:
+        from numba import njit
+
+        dispatcher = njit(nogil=True, error_model="numpy")(self._function)
+        dispatcher._cache = _code_on_disk()(self._function)
+        return dispatcher
+
+    @property
+    def _numba_type_(self) -> Any:
+        """What numba takes it for where compiled code calls it."""
+        return self._dispatcher._numba_type_
+
+
 def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Compile with numba: kept on disk, free of the interpreter lock, division as in IEEE 754."""
-    result: Callable[_P, _R] = njit(cache=True, nogil=True, error_model="numpy")(function)
+    result: Any = _Compiled(function)
+    return result
+
+
+def compiled_for_c(function: Callable[..., Any], signature: Any, kept: bool = True) -> Any:
+    """Compile a function that others call by its address, e.g. compiled code from a record.
+
+    `signature` is numba's. `kept` keeps the code on disk, for functions of this package only: of
+    others nobody sees when what they call changes. Returns numba's CFunc, with `address`, which
+    the code lives as long as. Raises numba's NumbaError where it does not compile.
+    """
+    from numba.core.ccallback import CFunc
+    from numba.core.sigutils import normalize_signature
+
+    result: Any = CFunc(function, normalize_signature(signature), {}, {"error_model": "numpy"})
+    if kept:
+        result._cache = _code_on_disk()(function)
+    result.compile()
     return result
 
 

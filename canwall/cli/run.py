@@ -48,10 +48,12 @@ def run(
         "drive__restore": restore or None,
     }
     many = [_run_settings(path, overrides) for path in files]
-    from canwall.run import run_together  # numba takes a second to load: not for --help
+    from canwall.record import start_recorders
 
-    with ProgressDisplay() as display:
-        results = run_together(many, output, display.report, display.advance)
+    with ProgressDisplay() as display, start_recorders(len(many)) as recorders:
+        from canwall.run import run_together  # while the writers of the record start
+
+        results = run_together(many, recorders, output, display.report, display.advance)
     for result in results:
         console.print(_strike_table(result.summary["strikes"]))
         console.print(f"record: {result.folder.path}", soft_wrap=True, highlight=False)

@@ -7,7 +7,7 @@ Every key has its unit in its name. An unknown key, a wrong type or an impossibl
 from canwall.config.drive import Drive
 from canwall.config.fault import Fault
 from canwall.config.hand import Hand, Move, RandomStrikes
-from canwall.config.reading import ConfigError, absolute_law, first_error, load, overridden, shipped
+from canwall.config.reading import absolute_law, first_error, load, overridden, shipped
 from canwall.config.settings import (
     Bus,
     Estimator,
@@ -21,6 +21,7 @@ from canwall.config.settings import (
     WallChange,
 )
 from canwall.config.simulation import Simulation
+from canwall.errors import ConfigError
 
 __all__ = [
     "Bus",

@@ -10,12 +10,7 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 
 from canwall.config.settings import Settings
-from canwall.errors import InputError
-
-
-class ConfigError(InputError):
-    """A configuration that cannot be used."""
-
+from canwall.errors import ConfigError
 
 # [wall] may be written with lengths and forces at a handle of radius r instead of angles and
 # torques at its shaft: the metric key, its angular one, and the exponent of r between them.

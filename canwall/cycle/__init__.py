@@ -2,7 +2,6 @@
 
 from canwall.cycle.axis import WallAxis, WallStage
 from canwall.cycle.bus_monitor import BusMonitor
-from canwall.cycle.delay import measured_delay
 from canwall.cycle.exchange import Exchange, SyncLostError
 from canwall.cycle.laws import named_law, run_laws, with_law
 from canwall.cycle.loop import Loop, Outcome, WallGivenUpError, run_loop
@@ -37,7 +36,6 @@ __all__ = [
     "buckets_ns",
     "fade_in",
     "make_cycle",
-    "measured_delay",
     "named_law",
     "observe_ns",
     "percentile_ns",

@@ -17,6 +17,7 @@ from canwall.compiled import Record, compiled
 from canwall.cycle.state import CYCLE
 from canwall.cycle.step import step
 from canwall.cycle.timing import HISTOGRAM, observe_ns
+from canwall.record.columns import ROW
 from canwall.record.ring import (
     ERROR,
     EXTENDED,
@@ -25,7 +26,6 @@ from canwall.record.ring import (
     HEADER,
     RECEIVED,
     REMOTE,
-    ROW,
     ROWS,
     put_frame,
     put_row,

@@ -14,7 +14,6 @@ import can
 
 from canwall import config
 from canwall.cycle.axis import WallAxis, WallStage
-from canwall.cycle.delay import DelayTest
 from canwall.cycle.exchange import Exchange
 from canwall.cycle.state import fade_in, fade_over, set_delay, set_limits, set_wall, start_at
 from canwall.cycle.trip_text import latest_emergency, shown_state, trip_text
@@ -141,6 +140,12 @@ class Loop:
         self._progress = progress
         self._period = float(self._axes[0].cycle["period"][0])
         self._progress_every = max(1, round(0.1 / self._period))
+        self._delay_tests = []
+        if any(axis.measures_delay for axis in self._axes):
+            # SciPy's optimizer takes some tenths of a second to load: before the first SYNC.
+            from canwall.cycle.delay import DelayTest
+
+            self._delay_tests = [DelayTest(axis) for axis in self._axes if axis.measures_delay]
 
     @property
     def j(self) -> int:
@@ -235,7 +240,7 @@ class Loop:
 
     def _measure_delays(self) -> bool:
         """Measure the delay of the axes that ask for it; return whether it was stopped before."""
-        tests = [DelayTest(axis) for axis in self._axes if axis.measures_delay]
+        tests = self._delay_tests
         if not tests:
             return False
         self._enter(Phase.MEASURING)

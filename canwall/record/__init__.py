@@ -4,10 +4,11 @@ The cycle writes into a ring in shared memory and never waits for a disk; a proc
 (`writer`) empties the ring into the run's folder, and completes the files even if the master dies.
 """
 
-from canwall.record.folder import RunFolder, read_signals
+from canwall.record.columns import ROW, TIMING_COLUMNS, Phase, column_table
+from canwall.record.folder import RunFolder, numbers, read_signals
 from canwall.record.mailbox import Mailbox
-from canwall.record.recorder import Recorder, RecordError
-from canwall.record.ring import FRAME, ROW, TIMING_COLUMNS, Phase, Ring
+from canwall.record.recorder import Recorder, RecordError, start_recorders
+from canwall.record.ring import FRAME, Ring
 
 __all__ = [
     "FRAME",
@@ -19,5 +20,8 @@ __all__ = [
     "Recorder",
     "Ring",
     "RunFolder",
+    "column_table",
+    "numbers",
     "read_signals",
+    "start_recorders",
 ]

@@ -2,18 +2,19 @@
 
 import contextlib
 import json
+from collections.abc import Collection
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.csv as pa_csv
-import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
-from canwall.config import ConfigError
-from canwall.record.ring import ROW
+from canwall.errors import ConfigError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 #: Cycles that are kept of the time before a trip.
 _TRIP_CYCLES = 200
@@ -24,27 +25,48 @@ def stream_of(signals: Path) -> Path:
     return signals.with_suffix(".arrows")
 
 
-def read_signals(path: Path) -> pa.Table:
-    """signals.parquet as a table; of a run that was cut off, what its stream has.
+def read_signals(path: Path, columns: Collection[str] = ("j",)) -> "pa.Table":
+    """Read signals.parquet as a table; of a run that was cut off, what its stream has.
 
-    Raises ConfigError where it is missing or not readable.
+    The table has the columns that the record has: one of another version may lack some or have
+    more. `columns` are those that the caller cannot do without.
+
+    Raises:
+        ConfigError: The file is missing, not readable, or lacks one of `columns`.
     """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     try:
         stream = stream_of(path)
-        table = _read_stream(stream) if stream.exists() else pq.read_table(path)
+        table = _read_stream(stream) if stream.exists() else pq.ParquetFile(path).read()
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; give the folder of a run") from None
     except (OSError, pa.ArrowInvalid) as error:
         reason = str(error).splitlines()[0]
         raise ConfigError(f"{path}: not a record of a run: {reason}") from None
-    missing = [name for name in ROW.names or () if name not in table.column_names]
+    missing = [name for name in columns if name not in table.column_names]
     if missing:
-        raise ConfigError(f"{path}: not a record of a run: lacks column {', '.join(missing)}")
+        raise ConfigError(
+            f"{path}: lacks column {', '.join(missing)}: not a record of a run, or an older one "
+            "than this needs"
+        )
     return table
 
 
-def _read_stream(path: Path) -> pa.Table:
+def numbers(signals: "pa.Table", name: str) -> NDArray[Any]:
+    """A column of numbers as an array, shape (n,).
+
+    As pyarrow's own `to_numpy`, which imports pandas first; that takes longer than a short run.
+    """
+    chunks = [np.from_dlpack(chunk) for chunk in signals[name].chunks]
+    return np.concatenate(chunks) if chunks else np.empty(0)
+
+
+def _read_stream(path: Path) -> "pa.Table":
     """The batches of a stream up to the one that was not written to its end."""
+    import pyarrow as pa
+
     with path.open("rb") as file, pa.ipc.open_stream(file) as stream:
         batches = []
         with contextlib.suppress(OSError, pa.ArrowInvalid):
@@ -114,9 +136,11 @@ class RunFolder:
         """The last cycles before a trip, every column, for a spreadsheet."""
         return self.path / "trip.csv"
 
-    def write_trip(self, signals: pa.Table, cycle: int) -> None:
+    def write_trip(self, signals: "pa.Table", cycle: int) -> None:
         """Keep the cycles up to the one that tripped. Shows them in the order of j."""
-        end = int(np.searchsorted(signals["j"].to_numpy(), cycle, side="right"))
+        import pyarrow.csv as pa_csv
+
+        end = int(np.searchsorted(numbers(signals, "j"), cycle, side="right"))
         pa_csv.write_csv(
             signals.slice(max(0, end - _TRIP_CYCLES), min(end, _TRIP_CYCLES)), self.trip
         )

@@ -1,22 +1,26 @@
 """The picture of a run, drawn from its record alone."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 import numpy as np
-import pyarrow as pa
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from canwall.figure_style import COLOURS, STYLE
-from canwall.record.folder import RunFolder, read_signals
+from canwall.record.folder import RunFolder, numbers, read_signals
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 Array = NDArray[np.float64]
 
 #: Length of a close-up [s].
 _CLOSE_UP_S = 0.045
+#: Columns of the record that are drawn.
+_DRAWN = ("t_s", "y", "torque_applied", "force_applied")
 
 
 def plot_run(folder: RunFolder) -> Path:
@@ -26,7 +30,7 @@ def plot_run(folder: RunFolder) -> Path:
     (Figure 5.19 of the source), and force over position (Figure 5.3). Raises ConfigError where
     the folder holds no record.
     """
-    signals, summary = read_signals(folder.signals), folder.read_summary()
+    signals, summary = read_signals(folder.signals, _DRAWN), folder.read_summary()
     strikes = summary["strikes"]
     laws = list(dict.fromkeys(strike["law"] for strike in strikes))
     colours = dict(zip(laws, COLOURS * 4, strict=False))
@@ -46,10 +50,6 @@ def plot_run(folder: RunFolder) -> Path:
     return folder.picture
 
 
-def _column(signals: pa.Table, name: str) -> Array:
-    return np.asarray(signals[name].to_numpy())
-
-
 def _mark_strikes(axes: Axes, strikes: list[dict[str, Any]], colours: dict[str, str]) -> None:
     for strike in strikes:
         axes.axvspan(
@@ -58,13 +58,13 @@ def _mark_strikes(axes: Axes, strikes: list[dict[str, Any]], colours: dict[str, 
 
 
 def draw_strikes(
-    axes: Axes, signals: pa.Table, strikes: list[dict[str, Any]], colours: dict[str, str]
+    axes: Axes, signals: "pa.Table", strikes: list[dict[str, Any]], colours: dict[str, str]
 ) -> None:
     """Position [mrad] over time, each strike of the summary with its law and whether it chatters.
 
     colours maps each law to its colour.
     """
-    t, y = _column(signals, "t_s"), _column(signals, "y") * 1e3
+    t, y = numbers(signals, "t_s"), numbers(signals, "y") * 1e3
     axes.plot(t, y, color="0.2", lw=0.7)
     axes.axhline(0.0, color="k", lw=0.8)
     low, high = float(y.min(initial=0.0)), float(y.max(initial=0.0))
@@ -90,11 +90,11 @@ def draw_strikes(
 
 
 def _torque(
-    axes: Axes, signals: pa.Table, strikes: list[dict[str, Any]], colours: dict[str, str]
+    axes: Axes, signals: "pa.Table", strikes: list[dict[str, Any]], colours: dict[str, str]
 ) -> None:
     axes.plot(
-        _column(signals, "t_s"),
-        _column(signals, "torque_applied"),
+        numbers(signals, "t_s"),
+        numbers(signals, "torque_applied"),
         color="0.2",
         lw=0.7,
         drawstyle="steps-post",
@@ -106,15 +106,15 @@ def _torque(
 
 
 def _close_up(
-    axes: Axes, signals: pa.Table, strike: dict[str, Any], colours: dict[str, str]
+    axes: Axes, signals: "pa.Table", strike: dict[str, Any], colours: dict[str, str]
 ) -> None:
-    t = _column(signals, "t_s")
+    t = numbers(signals, "t_s")
     start = max(strike["start_s"] - 0.1 * _CLOSE_UP_S, t[0])
     window = (t >= start) & (t <= start + _CLOSE_UP_S)
     milliseconds = (t[window] - strike["start_s"]) * 1e3
     # As in the source's figure: the force in units of position, f/K, over the position it opposes.
-    opposed = -_column(signals, "y")[window] * 1e3
-    held = _column(signals, "force_applied")[window] / strike["stiffness"] * 1e3
+    opposed = -numbers(signals, "y")[window] * 1e3
+    held = numbers(signals, "force_applied")[window] / strike["stiffness"] * 1e3
     colour = colours[strike["law"]]
     axes.plot(milliseconds, opposed, ".-", color="0.3", lw=0.8, ms=3, label="penetration −y")
     axes.step(milliseconds, held, where="post", color=colour, lw=1.2, label="force held, f/K")
@@ -126,10 +126,10 @@ def _close_up(
 
 
 def _force_over_position(
-    axes: Axes, signals: pa.Table, shown: list[dict[str, Any]], colours: dict[str, str]
+    axes: Axes, signals: "pa.Table", shown: list[dict[str, Any]], colours: dict[str, str]
 ) -> None:
-    t, y = _column(signals, "t_s"), _column(signals, "y") * 1e3
-    force = _column(signals, "force_applied")
+    t, y = numbers(signals, "t_s"), numbers(signals, "y") * 1e3
+    force = numbers(signals, "force_applied")
     deepest = 0.0
     for strike in shown:
         window = (t >= strike["start_s"]) & (t <= strike["start_s"] + _CLOSE_UP_S)

@@ -1,15 +1,21 @@
-"""The master's end of the record: starts the writer, and closes the record with it."""
+"""The master's end of the record: starts the writer, tells it what to do, and ends it."""
 
+import contextlib
 import json
+import os
+import select
 import subprocess
 import sys
+import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from canwall.errors import RunFailedError
 from canwall.record.ring import Ring
 
-#: How long a writer may take to complete its files after the run [s].
-_CLOSE_TIMEOUT_S = 60.0
+#: How long a writer may take to complete its files after the run, or to draw [s].
+_TIMEOUT_S = 60.0
 
 
 class RecordError(RunFailedError):
@@ -19,43 +25,48 @@ class RecordError(RunFailedError):
 class Recorder:
     """A run's record in the making.
 
-    Everything goes through `ring`. `close` completes the files; a master that dies has them
-    completed all the same.
+    The writer, a process of its own, empties `ring` into the run's folder. It takes some tenths of
+    a second to start: a recorder that is made early starts it beside other work. A context: at its
+    end the writer ends.
     """
 
-    def __init__(self, folder: Path, bus_log: str | None, channel: str, laws: list[str]) -> None:
-        """Start recording into an existing folder. Raises RecordError."""
-        self.folder = folder
+    def __init__(self) -> None:
+        """Start the writer. Raises RecordError."""
+        self.folder = Path()
         self.ring = Ring.create()
-        arguments = [
-            str(self.ring.descriptor),
-            str(folder),
-            bus_log or "",
-            channel,
-            json.dumps(laws),
-        ]
+        self._begun = False
         try:
             self._writer = subprocess.Popen(
-                [sys.executable, "-m", "canwall.record.writer", *arguments],
+                [sys.executable, "-P", "-m", "canwall.record.writer", str(self.ring.descriptor)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
+                bufsize=0,
                 pass_fds=[self.ring.descriptor],
                 start_new_session=True,  # Ctrl-C is meant for the master, who ends the writer
             )
         except OSError as error:
-            raise RecordError(
-                f"{folder}: the writer of the record does not start: {error}"
-            ) from None
+            raise RecordError(f"the writer of the record does not start: {error}") from None
+
+    def __enter__(self) -> "Recorder":
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        if not self._begun:
+            self._writer.kill()  # it may still be starting
+        with self._writer:  # closes the pipes, which ends it, and waits
+            pass
+        self.ring.close()
+
+    def begin(self, folder: Path, bus_log: str, channel: str, laws: Sequence[str]) -> None:
+        """Record into an existing folder from now on; an empty `bus_log`: without the frames."""
+        self.folder = folder
+        self._begun = True
+        self._tell(folder=str(folder), bus_log=bus_log, channel=channel, laws=list(laws))
 
     def close(self) -> list[str]:
         """Complete the files. Returns what a reader of the record has to know, a line each."""
-        try:
-            out, _ = self._writer.communicate(timeout=_CLOSE_TIMEOUT_S)
-            error = json.loads(out)["error"]
-        except (subprocess.TimeoutExpired, ValueError):
-            self._writer.kill()
-            self._writer.communicate()
-            error = "the writer of the record did not finish"
+        self._tell(close=True)
+        error = self._answer()
         header = self.ring.header[0]
         notes = [f"{self.folder}: the record is incomplete: {error}"] if error else []
         for what in ("rows", "frames"):
@@ -63,3 +74,36 @@ class Recorder:
             if lost:
                 notes.append(f"{self.folder}: {lost} {what} lost: the disk was too slow")
         return notes
+
+    def draw(self) -> list[str]:
+        """Draw run.png once the summary is written. Returns what went wrong, a line each."""
+        self._tell(draw=True)
+        error = self._answer()
+        return [f"{self.folder}: the picture is missing: {error}"] if error else []
+
+    def _tell(self, **order: Any) -> None:
+        assert self._writer.stdin is not None
+        with contextlib.suppress(BrokenPipeError):  # a writer that has died does not answer either
+            self._writer.stdin.write(json.dumps(order).encode() + b"\n")
+
+    def _answer(self) -> str:
+        """What went wrong, empty if nothing."""
+        assert self._writer.stdout is not None
+        line, deadline = b"", time.monotonic() + _TIMEOUT_S
+        while not line.endswith(b"\n"):
+            wait_s = max(0.0, deadline - time.monotonic())
+            readable, _, _ = select.select([self._writer.stdout], [], [], wait_s)
+            part = os.read(self._writer.stdout.fileno(), 4096) if readable else b""
+            if not part:
+                self._writer.kill()
+                return "the writer of the record did not finish"
+            line += part
+        error: str = json.loads(line)["error"]
+        return error
+
+
+@contextlib.contextmanager
+def start_recorders(count: int) -> Iterator[list[Recorder]]:
+    """Recorders for so many drives; they end with the context. Raises RecordError."""
+    with contextlib.ExitStack() as stack:
+        yield [stack.enter_context(Recorder()) for _ in range(count)]

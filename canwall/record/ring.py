@@ -1,4 +1,4 @@
-"""The rows of a record, and the ring in shared memory that carries them to the writer.
+"""The ring in shared memory that carries the rows and frames of a run to the writer.
 
 One writer and one reader for each of the two rings (cycles and frames). Each side owns one
 counter: the head counts what was put in, the tail what was taken out; neither ever runs back.
@@ -6,58 +6,13 @@ counter: the head counts what was put in, the tail what was taken out; neither e
 
 import mmap
 import os
-from enum import IntEnum
 
 import can
 import numpy as np
 from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled, data_to_number, number_to_data
-
-
-class Phase(IntEnum):
-    """What a cycle was for."""
-
-    ENABLING = 0
-    RENDERING = 1
-    LEAVING = 2
-    MEASURING = 3
-
-
-#: One cycle, as `signals.parquet` has it. Positions and torques with a sign of the drive's axis
-#: say so; y and force are the wall's (y < 0 inside, force > 0 out of it).
-ROW = np.dtype(
-    [
-        ("j", "i8"),  # SYNC count
-        ("t_s", "f8"),  # j times the cycle, from the first SYNC on
-        ("phase", "u1"),  # Phase
-        ("received", "?"),  # whether this SYNC's TPDO came in time
-        ("counts", "i4"),  # 0x6064
-        ("statusword", "u2"),  # 0x6041
-        ("controlword", "u2"),  # 0x6040 as sent
-        ("position_rad", "f8"),  # of the drive's axis
-        ("y", "f8"),  # relative to the wall, as sampled
-        ("y_est", "f8"),  # at the instant of actuation
-        ("v_est", "f8"),
-        ("d_est", "f8"),  # estimated bias force
-        ("force", "f8"),  # what the law wants from the instant of actuation on
-        ("torque_cmd_per_mille", "i2"),  # 0x6071 as sent
-        ("torque_cmd", "f8"),  # the same in N·m, drive's axis
-        ("torque_actual", "f8"),  # 0x6077 in N·m, drive's axis
-        ("torque_applied", "f8"),  # in force from this SYNC to the next [N·m], drive's axis
-        ("force_applied", "f8"),  # the same, out of the wall
-        ("law", "u1"),  # index into the laws of the run
-        ("stiffness", "f8"),
-        ("damping", "f8"),
-        ("wall_position_rad", "f8"),
-        ("sync_interval_s", "f8"),  # since the SYNC before, by the clock
-        ("latency_s", "f8"),  # from the TPDO's reception to the RPDO's sending
-    ],
-    align=True,
-)
-
-#: Columns that the clock of the machine decides; all others are the same from run to run.
-TIMING_COLUMNS = ("sync_interval_s", "latency_s")
+from canwall.record.columns import ROW
 
 #: Bits of a FRAME's flags.
 RECEIVED, REMOTE, ERROR, EXTENDED = 1, 2, 4, 8

@@ -1,30 +1,33 @@
 """The summary of a run: the metrics over its record, strike by strike."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from canwall.analysis import metrics
 from canwall.config import Settings
-from canwall.record.ring import Phase
+from canwall.record.columns import Phase
+from canwall.record.folder import numbers
 from canwall.units import DriveUnits
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 Array = NDArray[np.float64]
 
 
 def summarise(
-    signals: pa.Table, settings: Settings, units: DriveUnits, referent: Array | None
+    signals: "pa.Table", settings: Settings, units: DriveUnits, referent: Array | None
 ) -> dict[str, Any]:
     """Energy, contacts and chatter of a run.
 
     signals is the run's record, one row per cycle; referent the continuous wall's positions at
     the same SYNCs, shape (n,), or None where a person was at the handle.
     """
-    y, force = signals["y"].to_numpy(), signals["force_applied"].to_numpy()
-    stiffness, laws = signals["stiffness"].to_numpy(), signals["law"].to_pylist()
-    rendering = signals["phase"].to_numpy() == Phase.RENDERING
+    y, force = numbers(signals, "y"), numbers(signals, "force_applied")
+    stiffness, laws = numbers(signals, "stiffness"), signals["law"]
+    rendering = numbers(signals, "phase") == Phase.RENDERING
     work = metrics.energy_out(y, force)
     touched = metrics.contacts(np.where(rendering, y, np.inf), force)
     strikes = [
@@ -32,7 +35,7 @@ def summarise(
         for strike in metrics.strikes(touched, settings.bus.cycle_s, _changes(signals))
     ]
     chattering = [s for s in strikes if s["chatter"]]
-    torque = signals["torque_cmd"].to_numpy()
+    torque = numbers(signals, "torque_cmd")
     return {
         "law": list(dict.fromkeys(stage.wall.law for stage in settings.stages)),
         "stiffness": settings.wall.stiffness_nm_per_rad,
@@ -49,10 +52,10 @@ def summarise(
     }
 
 
-def _changes(signals: pa.Table) -> Array:
+def _changes(signals: "pa.Table") -> Array:
     """Cycles at which law, stiffness, damping or place of the wall are others than before."""
-    columns = [signals["law"].combine_chunks().indices.to_numpy()]
-    columns += [signals[c].to_numpy() for c in ("stiffness", "damping", "wall_position_rad")]
+    columns = [np.from_dlpack(signals["law"].combine_chunks().indices)]
+    columns += [numbers(signals, name) for name in ("stiffness", "damping", "wall_position_rad")]
     differs = np.any([np.diff(column) != 0 for column in columns], axis=0)
     return np.flatnonzero(differs).astype(float) + 1.0
 
@@ -63,7 +66,7 @@ def _strike(
     force: Array,
     work: Array,
     stiffness: Array,
-    laws: list[str],
+    laws: "pa.ChunkedArray",
     settings: Settings,
     units: DriveUnits,
     referent: Array | None,
@@ -86,7 +89,7 @@ def _strike(
     return {
         "start_s": start * period,
         "end_s": cycles.stop * period,
-        "law": laws[start],
+        "law": laws[start].as_py(),
         "stiffness": float(stiffness[start]),
         "contacts": len(strike.contacts),
         "peak_penetration_rad": float(-inside.min(initial=0.0)),

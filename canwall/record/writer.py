@@ -1,7 +1,9 @@
 """The process that empties the ring into the run's folder: `python -m canwall.record.writer`.
 
-It ends when the master closes its end of the pipe, in order or by dying, and completes the files
-first. Its last words go to standard output as JSON: what was written and what was lost.
+It takes orders from its standard input (`recorder.Recorder` gives them) and answers on standard
+output, a line of JSON each. It ends when the master closes its end of the pipe, by an order or by
+dying, and completes the files first. It also draws the picture: it is there, has nothing to do
+while the master sets up the drive, and can load the plotting library meanwhile.
 """
 
 import contextlib
@@ -20,25 +22,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from canwall.record.folder import stream_of
-from canwall.record.ring import ROW, Ring, to_message
+from canwall.errors import ConfigError
+from canwall.record.columns import record_batch, schema
+from canwall.record.folder import RunFolder, stream_of
+from canwall.record.pictures import plot_run
+from canwall.record.ring import Ring, to_message
 
 #: Rows of one row group, unless the run ends before.
 _ROW_GROUP = 8192
 _POLL_S = 0.02
 #: How much of a run a loss of power may take.
 _SYNCHRONISE_S = 0.5
-
-
-def schema(laws: list[str]) -> pa.Schema:
-    """Columns of signals.parquet: those of ROW, the law by its name."""
-    fields = [
-        pa.field("law", pa.dictionary(pa.uint8(), pa.string()))
-        if name == "law"
-        else pa.field(name, pa.from_numpy_dtype(ROW[name]))
-        for name in ROW.names or ()
-    ]
-    return pa.schema(fields, metadata={"laws": json.dumps(laws)})
 
 
 class _SignalsFile:
@@ -49,8 +43,8 @@ class _SignalsFile:
     """
 
     def __init__(self, path: Path, laws: list[str]) -> None:
+        self._laws = laws
         self._schema = schema(laws)
-        self._names = pa.array(laws, pa.string())
         self._path = path
         self._stream_path = stream_of(path)
         self._file = self._stream_path.open("wb")
@@ -65,13 +59,7 @@ class _SignalsFile:
         if self._waiting:
             rows = np.concatenate(self._waiting)
             self._waiting = []
-            columns = [
-                pa.DictionaryArray.from_arrays(pa.array(rows["law"]), self._names)
-                if name == "law"
-                else pa.array(np.ascontiguousarray(rows[name]))
-                for name in ROW.names or ()
-            ]
-            self._stream.write_batch(pa.RecordBatch.from_arrays(columns, schema=self._schema))
+            self._stream.write_batch(record_batch(rows, self._laws))
         _synchronise(self._file)
 
     def close(self) -> None:
@@ -121,8 +109,10 @@ class _BusLog:
             self._log.stop()
 
 
-def write(ring: Ring, folder: Path, bus_log: str, channel: str, laws: list[str]) -> None:
-    """Empty the ring into the folder until standard input ends."""
+def write(
+    ring: Ring, orders: IO[bytes], folder: Path, bus_log: str, channel: str, laws: list[str]
+) -> None:
+    """Empty the ring into the folder until there is an order, or nobody left to give one."""
     signals = _SignalsFile(folder / "signals.parquet", laws)
     log = _BusLog(folder / bus_log if bus_log else None, channel)
 
@@ -137,8 +127,7 @@ def write(ring: Ring, folder: Path, bus_log: str, channel: str, laws: list[str])
     synchronised = time.monotonic()
     while not ended:
         if not drain():
-            readable, _, _ = select.select([sys.stdin], [], [], _POLL_S)
-            ended = bool(readable)
+            ended = _is_ordered(orders, _POLL_S)
         if time.monotonic() - synchronised >= _SYNCHRONISE_S:
             signals.synchronise()
             log.synchronise()
@@ -148,22 +137,53 @@ def write(ring: Ring, folder: Path, bus_log: str, channel: str, laws: list[str])
     log.close()
 
 
-def main() -> None:
-    """Arguments: descriptor of the ring, folder, name of the bus log, channel, laws as JSON."""
-    descriptor, folder, bus_log, channel, laws = sys.argv[1:]
-    error = ""
-    ring = Ring(int(descriptor))
+def _is_ordered(orders: IO[bytes], timeout_s: float) -> bool:
+    return bool(select.select([orders], [], [], timeout_s)[0])
+
+
+def _record(ring: Ring, orders: IO[bytes], order: dict[str, Any]) -> str:
+    """Write the record that the order describes; what went wrong, empty if nothing."""
     try:
-        write(ring, Path(folder), bus_log, channel, json.loads(laws))
+        write(
+            ring, orders, Path(order["folder"]), order["bus_log"], order["channel"], order["laws"]
+        )
     except (OSError, pa.ArrowException, sqlite3.Error) as failure:
-        error = str(failure)
         # The master is not to hear of it by its ring filling up: keep emptying it.
-        while not select.select([sys.stdin], [], [], _POLL_S)[0]:
+        while not _is_ordered(orders, _POLL_S):
             ring.take_frames()
             ring.take_rows()
-    # Not through the stream: what it could not get rid of it would complain about at exit.
+        return str(failure)
+    return ""
+
+
+def _draw(folder: Path) -> str:
+    """Draw the run's picture; what went wrong, empty if nothing."""
+    try:
+        plot_run(RunFolder(folder))
+    except (OSError, ConfigError) as failure:
+        return str(failure)
+    return ""
+
+
+def _answer(error: str) -> None:
     with contextlib.suppress(BrokenPipeError):
-        os.write(sys.stdout.fileno(), json.dumps({"error": error}).encode())
+        os.write(sys.stdout.fileno(), json.dumps({"error": error}).encode() + b"\n")
+
+
+def main() -> None:
+    """Take orders, a line of JSON each: what to record, to complete it, to draw it."""
+    ring = Ring(int(sys.argv[1]))
+    # Unbuffered: a line that waits is to be seen by select.
+    with open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as orders:
+        if begin := orders.readline():
+            order = json.loads(begin)
+            error = _record(ring, orders, order)
+            if orders.readline():
+                _answer(error)
+            while orders.readline():
+                _answer(_draw(Path(order["folder"])))
+    sys.stderr.flush()
+    os._exit(0)  # everything is written; to take libraries down properly takes longer than to write
 
 
 if __name__ == "__main__":

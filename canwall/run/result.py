@@ -2,17 +2,18 @@
 
 import json
 from dataclasses import dataclass
-from typing import Any
-
-import pyarrow as pa
+from typing import TYPE_CHECKING, Any
 
 from canwall.config import ConfigError, Settings
 from canwall.cycle import BusMonitor, Exchange, Grant, Outcome, WallAxis, timing_summary
 from canwall.drive import DriveSetup
 from canwall.errors import RunFailedError
-from canwall.record import RecordError, RunFolder, read_signals
+from canwall.record import RecordError, RunFolder, numbers, read_signals
 from canwall.record.summary import summarise
 from canwall.run.referent import referent_positions
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ def result_of(
     """
     settings = axis.settings
     signals = _read_recorded(folder, [*outcome.trips, *notes])
-    wall = (signals[name].to_numpy() for name in ("stiffness", "damping", "wall_position_rad"))
+    wall = (numbers(signals, name) for name in ("stiffness", "damping", "wall_position_rad"))
     referent = referent_positions(settings, *wall)
     summary = summarise(signals, settings, axis.setup.units, referent)
     summary |= {
@@ -85,7 +86,7 @@ def _real_time_summary(axis: WallAxis, exchange: Exchange) -> dict[str, Any]:
     }
 
 
-def _read_recorded(folder: RunFolder, troubles: list[str]) -> pa.Table:
+def _read_recorded(folder: RunFolder, troubles: list[str]) -> "pa.Table":
     """Read the signals of the run; without any, raise an error with its troubles."""
     try:
         signals = read_signals(folder.signals)

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from canwall.config import ConfigError, Settings
 from canwall.cycle import run_laws
-from canwall.record import Recorder, RunFolder
-from canwall.record.pictures import plot_run
+from canwall.record import Recorder, RunFolder, start_recorders
 from canwall.run.assembly import (
     drive_dictionary,
     make_axis,
@@ -51,12 +50,14 @@ def run(
         DriveError: If the drive cannot be set up.
         RunFailedError: If no cycle was rendered or recorded.
     """
-    (result,) = run_together([settings], output, report, progress, stopped)
+    with start_recorders(1) as recorders:
+        (result,) = run_together([settings], recorders, output, report, progress, stopped)
     return result
 
 
 def run_together(
     many: Sequence[Settings],
+    recorders: Sequence[Recorder],
     output: Path | None,
     report: Callable[[str], None] = lambda what: None,
     progress: Callable[[float, float | None], None] = lambda now_s, end_s: None,
@@ -64,8 +65,8 @@ def run_together(
 ) -> list[RunResult]:
     """Call `run` for several drives on one bus, each with its wall, on one SYNC.
 
-    Their `[bus]` and `[run]` have to be equal. Each drive's record has a folder of its own,
-    `node5` …; the bus log is next to these folders.
+    Their `[bus]` and `[run]` have to be equal. Each drive's record has a recorder and a folder of
+    its own, `node5` …; the bus log is next to these folders.
     """
     _check_together(many)
     laws = [run_laws(settings) for settings in many]
@@ -73,17 +74,15 @@ def run_together(
     first = many[0]
     with on_the_bus(*many) as link:
         folders = _run_folders(many, output)
-        recorders: list[Recorder] = []
         notes: list[list[str]] = []
+        # One log of the bus for all of them.
+        log = first.run.bus_log if len(many) == 1 else f"../{first.run.bus_log}"
+        for settings, folder, known, recorder in zip(many, folders, laws, recorders, strict=True):
+            folder.config.write_text(settings.to_toml(), encoding="utf-8")
+            bus_log = log if recorder is recorders[0] else ""
+            names = [law.name for law in known]
+            recorder.begin(folder.path, bus_log, first.bus.channel, names)
         try:
-            for settings, folder, known in zip(many, folders, laws, strict=True):
-                folder.config.write_text(settings.to_toml(), encoding="utf-8")
-                # One log of the bus for all of them.
-                log = first.run.bus_log if len(many) == 1 else f"../{first.run.bus_log}"
-                names = [law.name for law in known]
-                recorders.append(
-                    Recorder(folder.path, None if recorders else log, first.bus.channel, names)
-                )
             link.log = recorders[0].ring.log_frame
             report("setting up the drive" if len(many) == 1 else "setting up the drives")
             with restoring_drives() as (axes, not_restored):
@@ -117,8 +116,8 @@ def run_together(
             result_of(axis, exchange, monitor, machine, folder, outcome, of_axis, remarks)
         )
     report("drawing")
-    for folder in folders:
-        plot_run(folder)
+    for recorder, result in zip(recorders, results, strict=True):
+        result.notes.extend(recorder.draw())
     return results
 
 

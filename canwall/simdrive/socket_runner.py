@@ -1,7 +1,10 @@
 """A simulated drive at the other end of a socket pair, in steady operation without Python."""
 
+import functools
+from typing import Any
+
 import numpy as np
-from numba import cfunc, types
+from numba import types
 from numpy.typing import NDArray
 
 from canwall.bus.raw_socket import (
@@ -17,7 +20,7 @@ from canwall.bus.raw_socket import (
 )
 from canwall.bus.socket_pair import SocketPairBus
 from canwall.bus.unixcan import decode_frame
-from canwall.compiled import Record, compiled
+from canwall.compiled import Record, compiled, compiled_for_c
 from canwall.simdrive.faults import FaultyDrive
 from canwall.simdrive.runner import BusRunner
 from canwall.simdrive.state import DRIVE
@@ -73,10 +76,14 @@ def serve(servers: NDArray[np.void]) -> int:
     return 1
 
 
-@cfunc(types.int64(types.uint64), cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _serve_at(address: int) -> int:
     """Call `serve` for the record at an address."""
     return serve(elements(address, 1, SERVER))
+
+
+@functools.cache
+def _compiled_serve_at() -> Any:
+    return compiled_for_c(_serve_at, types.int64(types.uint64))
 
 
 class SocketRunner(BusRunner):
@@ -90,7 +97,7 @@ class SocketRunner(BusRunner):
         record["drive"] = drive.drive.state.record.ctypes.data
         record["descriptor"] = bus.fileno()
         place_port(record["port"][0])
-        self.compiled = CFunction(int(_serve_at.address), record.ctypes.data)
+        self.compiled = CFunction(int(_compiled_serve_at().address), record.ctypes.data)
         """What compiled code calls instead of `poll`."""
 
     def poll(self) -> None:

@@ -10,7 +10,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_discrete_are
 
 from canwall.compiled import Record, compiled
 from canwall.physics import zoh
@@ -55,6 +54,8 @@ def kalman_gain(
     poles at ω = (q²/(m²·R·T))^(1/6): one setting follows a light handle faster than a heavy one,
     as their noise allows.
     """
+    from scipy.linalg import solve_discrete_are  # a tenth of a second: not for a drive alone
+
     phi, gamma = zoh(mass, viscous, spring, period)
     a = np.eye(3)
     a[:2, :2] = phi

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import cfunc, from_dtype, types
+from numba import from_dtype, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from canwall.compiled import Record, compiled
+from canwall.compiled import Record, compiled, compiled_for_c
 from canwall.errors import InputError
 from canwall.physics import PLANT, zoh
 
@@ -131,8 +131,7 @@ class Law:
         with self._compiling:
             if self._compiled is None:
                 signature = types.float64(from_dtype(wall_with(self.options)))
-                compiling = cfunc(signature, cache=self._cached, error_model="numpy")
-                self._compiled = compiling(self._function)
+                self._compiled = compiled_for_c(self._function, signature, self._cached)
 
     @property
     def address(self) -> int:

@@ -62,8 +62,12 @@ def whole_loop() -> dict[str, Any]:
 
 def _rate_of_run(settings: Settings) -> float:
     laws = run_laws(settings)
-    with tempfile.TemporaryDirectory() as folder, on_the_bus(settings) as link:
-        recorder = Recorder(Path(folder), "bus.log", "bench", [law.name for law in laws])
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        on_the_bus(settings) as link,
+        Recorder() as recorder,
+    ):
+        recorder.begin(Path(folder), "bus.log", "bench", [law.name for law in laws])
         link.log = recorder.ring.log_frame
         axis = make_axis(link, settings, drive_dictionary(settings), laws, recorder.ring)
         exchange = make_exchange(link, [axis])

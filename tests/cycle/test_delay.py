@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from rig import Loop, RigFactory, settings_with
 
 from canwall.config import Mechanics
-from canwall.cycle import measured_delay
-from canwall.cycle.delay import excitation
+from canwall.cycle.delay import excitation, measured_delay
 from canwall.physics import zoh
 from canwall.record import Phase
 

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import can
@@ -21,8 +22,8 @@ from numpy.typing import NDArray
 
 from canwall.config import ConfigError
 from canwall.record import ROW, Recorder, RecordError, Ring, RunFolder, read_signals
+from canwall.record.columns import schema
 from canwall.record.ring import FRAMES, ROWS, put_frame, put_row, to_message
-from canwall.record.writer import schema
 
 LAWS = ["standard", "half_sample"]
 PATIENCE_S = 30.0
@@ -73,6 +74,13 @@ def assert_rows(table: pa.Table, rows: NDArray[np.void]) -> None:
             assert table[name].to_pylist() == [LAWS[law] for law in rows["law"]]
         else:
             assert table[name].to_numpy().tolist() == rows[name].tolist()
+
+
+@contextlib.contextmanager
+def recording(folder: Path, bus_log: str = "bus.log") -> Iterator[Recorder]:
+    with Recorder() as recorder:
+        recorder.begin(folder, bus_log, "canwall", LAWS)
+        yield recorder
 
 
 def wait_until_written(ring: Ring) -> None:
@@ -160,16 +168,16 @@ def test_full_ring_counts_what_it_loses() -> None:
 
 @pytest.mark.parametrize("bus_log", ["bus.log", "bus.asc", "bus.blf"])
 def test_round_trip_through_the_writer(tmp_path: Path, bus_log: str) -> None:
-    recorder = Recorder(tmp_path, bus_log, "canwall", LAWS)
     rows, frames = some_rows(20_000), some_frames(500)  # more than one row group
-    log(recorder.ring, frames[:-1])
-    for start in range(0, len(rows), 5000):
-        put_rows(recorder.ring, rows[start : min(start + 5000, len(rows) - 1)])
-        wait_until_written(recorder.ring)
-    time.sleep(0.1)  # now the writer has nothing to do, and will not have looked when it is to end
-    put_rows(recorder.ring, rows[-1:])
-    log(recorder.ring, frames[-1:])
-    assert recorder.close() == []
+    with recording(tmp_path, bus_log) as recorder:
+        log(recorder.ring, frames[:-1])
+        for start in range(0, len(rows), 5000):
+            put_rows(recorder.ring, rows[start : min(start + 5000, len(rows) - 1)])
+            wait_until_written(recorder.ring)
+        time.sleep(0.1)  # now the writer is idle, and will not have looked when it is to end
+        put_rows(recorder.ring, rows[-1:])
+        log(recorder.ring, frames[-1:])
+        assert recorder.close() == []
     table = read_signals(tmp_path / "signals.parquet")
     assert_rows(table, rows)
     assert table.schema.metadata[b"laws"] == json.dumps(LAWS).encode()
@@ -184,7 +192,8 @@ def test_round_trip_through_the_writer(tmp_path: Path, bus_log: str) -> None:
 
 
 def test_empty_record(tmp_path: Path) -> None:
-    assert Recorder(tmp_path, "bus.log", "canwall", LAWS).close() == []
+    with recording(tmp_path) as recorder:
+        assert recorder.close() == []
     table = read_signals(tmp_path / "signals.parquet")
     assert table.num_rows == 0
     assert table.schema.equals(schema(LAWS))
@@ -192,35 +201,35 @@ def test_empty_record(tmp_path: Path) -> None:
 
 
 def test_what_was_lost_is_reported(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path, "bus.log", "canwall", LAWS)
-    recorder.ring.header["rows_lost"] = 7
-    recorder.ring.header["frames_lost"] = 9
-    assert recorder.close() == [
-        f"{tmp_path}: 7 rows lost: the disk was too slow",
-        f"{tmp_path}: 9 frames lost: the disk was too slow",
-    ]
+    with recording(tmp_path) as recorder:
+        recorder.ring.header["rows_lost"] = 7
+        recorder.ring.header["frames_lost"] = 9
+        assert recorder.close() == [
+            f"{tmp_path}: 7 rows lost: the disk was too slow",
+            f"{tmp_path}: 9 frames lost: the disk was too slow",
+        ]
 
 
 def test_folder_that_cannot_be_written(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path / "nowhere", "bus.log", "canwall", LAWS)
-    put_rows(recorder.ring, some_rows(10))
-    wait_until_written(recorder.ring)  # emptied all the same
-    (note,) = recorder.close()
+    with recording(tmp_path / "nowhere") as recorder:
+        put_rows(recorder.ring, some_rows(10))
+        wait_until_written(recorder.ring)  # emptied all the same
+        (note,) = recorder.close()
     assert "the record is incomplete" in note
     assert "\n" not in note
 
 
 def test_writer_that_dies(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path, "bus.log", "canwall", LAWS)
-    recorder._writer.kill()
-    (note,) = recorder.close()
+    with recording(tmp_path) as recorder:
+        recorder._writer.kill()
+        (note,) = recorder.close()
     assert "the writer of the record did not finish" in note
 
 
 def test_writer_that_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", str(tmp_path / "no-python"))
     with pytest.raises(RecordError, match="does not start"):
-        Recorder(tmp_path, "bus.log", "canwall", LAWS)
+        Recorder()
 
 
 # A master that ends otherwise
@@ -232,7 +241,8 @@ from test_record import LAWS, log, put_rows, some_frames, some_rows
 from canwall.record import Recorder
 
 signal.signal(signal.SIGINT, lambda number, frame: None)
-recorder = Recorder(Path(sys.argv[1]), "bus.log", "canwall", LAWS)
+recorder = Recorder()
+recorder.begin(Path(sys.argv[1]), "bus.log", "canwall", LAWS)
 if sys.argv[2] == "ctrl-c":
     os.killpg(0, signal.SIGINT)  # as a terminal does: to master and writer, here a starting one
 put_rows(recorder.ring, some_rows(3000))
@@ -251,7 +261,7 @@ def master(folder: Path, what: str) -> "subprocess.Popen[str]":
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])},
     )
 
 
@@ -317,8 +327,8 @@ def test_what_is_no_record(tmp_path: Path) -> None:
     folder.signals.write_text("PAR1 or not")
     with pytest.raises(ConfigError, match="not a record of a run"):
         read_signals(folder.signals)
-    pq.write_table(pa.table({"j": [1, 2]}), folder.signals)
-    with pytest.raises(ConfigError, match="not a record of a run: lacks column t_s, phase"):
+    pq.write_table(pa.table({"t_s": [1, 2]}), folder.signals)
+    with pytest.raises(ConfigError, match="lacks column j: not a record of a run"):
         read_signals(folder.signals)
     with pytest.raises(ConfigError, match="not a summary of a run"):
         folder.read_summary()
@@ -342,14 +352,13 @@ def wait_until_on_disk(folder: Path, rows: int) -> None:
 
 def test_record_is_readable_without_its_end(tmp_path: Path) -> None:
     """Loss of power: neither master nor writer gets to say a last word."""
-    recorder = Recorder(tmp_path, "bus.log", "ch", LAWS)
     rows, frames = some_rows(3000), some_frames(100)
-    log(recorder.ring, frames)
-    for part in np.split(rows, 3):
-        put_rows(recorder.ring, part)
-        wait_until_on_disk(tmp_path, int(part["j"][-1]) + 1)
-    recorder._writer.kill()
-    recorder.close()
+    with recording(tmp_path) as recorder:
+        log(recorder.ring, frames)
+        for part in np.split(rows, 3):
+            put_rows(recorder.ring, part)
+            wait_until_on_disk(tmp_path, int(part["j"][-1]) + 1)
+        recorder._writer.kill()
     assert not (tmp_path / "signals.parquet").exists()
     assert_rows(read_signals(tmp_path / "signals.parquet"), rows)
     lines = (tmp_path / "bus.log").read_text().splitlines()
@@ -357,17 +366,16 @@ def test_record_is_readable_without_its_end(tmp_path: Path) -> None:
 
 
 def test_stream_that_was_cut_anywhere_is_readable_up_to_there(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path, None, "ch", LAWS)
     rows = some_rows(1500)
-    for part in np.split(rows, 3):
-        put_rows(recorder.ring, part)
-        wait_until_on_disk(tmp_path, int(part["j"][-1]) + 1)
-    recorder._writer.kill()
-    recorder.close()
+    with recording(tmp_path, bus_log="") as recorder:
+        for part in np.split(rows, 3):
+            put_rows(recorder.ring, part)
+            wait_until_on_disk(tmp_path, int(part["j"][-1]) + 1)
+        recorder._writer.kill()
     stream = tmp_path / "signals.arrows"
     whole = stream.read_bytes()
     found = set()
-    for size in range(len(whole), 2000, -997):
+    for size in range(len(whole), schema(LAWS).serialize().size, -997):
         stream.write_bytes(whole[:size])
         table = read_signals(tmp_path / "signals.parquet")
         found.add(table.num_rows)
@@ -377,13 +385,13 @@ def test_stream_that_was_cut_anywhere_is_readable_up_to_there(tmp_path: Path) ->
 
 
 def test_disk_that_is_full_is_told_and_stops_nothing(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path, "bus.log", "ch", LAWS)
-    resource.prlimit(recorder._writer.pid, resource.RLIMIT_FSIZE, (100_000, 100_000))
     rows = some_rows(ROWS // 2)
-    for _ in range(5):  # more than the ring holds
-        put_rows(recorder.ring, rows)
-        wait_until_written(recorder.ring)
-    (note,) = recorder.close()
+    with recording(tmp_path) as recorder:
+        resource.prlimit(recorder._writer.pid, resource.RLIMIT_FSIZE, (100_000, 100_000))
+        for _ in range(5):  # more than the ring holds
+            put_rows(recorder.ring, rows)
+            wait_until_written(recorder.ring)
+        (note,) = recorder.close()
     assert note.startswith(f"{tmp_path}: the record is incomplete: ")
     assert "File too large" in note
     kept = read_signals(tmp_path / "signals.parquet")

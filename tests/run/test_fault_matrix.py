@@ -13,12 +13,11 @@ from commands import Record, config_file
 from rig import SDO_REQUEST, SYNC
 
 import canwall.run.buses
-import canwall.run.running
 from canwall import cli, simdrive
 from canwall.config import Settings
 from canwall.cycle import exchange as exchange_module
 from canwall.faults import KINDS
-from canwall.record import Phase
+from canwall.record import Phase, Recorder
 
 CASES = Path(__file__).with_name("fault_cases.txt")
 DOCUMENT = Path(__file__).parents[2] / "docs" / "ways_out.md"
@@ -100,7 +99,7 @@ def witnesses(monkeypatch: pytest.MonkeyPatch) -> list[Witness]:
         return drive
 
     monkeypatch.setattr(canwall.run.buses, "make_simulated_drive", watched)
-    monkeypatch.setattr(canwall.run.running, "plot_run", lambda folder: None)
+    monkeypatch.setattr(Recorder, "draw", lambda recorder: [])
     monkeypatch.setattr(exchange_module, "_SIMULATED_TIMEOUT_S", 0.02)
     monkeypatch.setattr(exchange_module, "_MISSING_TIMEOUT_S", 0.002)
     return found

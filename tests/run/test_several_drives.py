@@ -8,7 +8,7 @@ import pytest
 from rig import settings_with
 
 from canwall.config import ConfigError, Settings
-from canwall.record import TIMING_COLUMNS, read_signals
+from canwall.record import TIMING_COLUMNS, read_signals, start_recorders
 from canwall.run import RunResult, run, run_together
 
 DURATION_S = 0.6
@@ -27,13 +27,18 @@ def columns(result: RunResult) -> dict[str, Any]:
     return {name: table[name].to_pylist() for name in names}
 
 
+def run_all(many: list[Settings], output: Path) -> list[RunResult]:
+    with start_recorders(len(many)) as recorders:
+        return run_together(many, recorders, output)
+
+
 def test_each_is_as_if_it_were_alone(tmp_path: Path) -> None:
     many = [
         settings_of(5, {"wall.law": "half_sample"}),
         settings_of(6, {"wall.law": "mean_force", "wall.stiffness_nm_per_rad": 80.0}),
         settings_of(17, {"wall.law": "standard", "simulation.inertia_kg_m2": 3e-4}),
     ]
-    together = run_together(many, tmp_path / "together")
+    together = run_all(many, tmp_path / "together")
     assert [result.folder.path.name for result in together] == ["node5", "node6", "node17"]
     for settings, result in zip(many, together, strict=True):
         assert result.outcome.trips == []
@@ -56,7 +61,7 @@ def test_trip_of_one_takes_the_torque_from_all(tmp_path: Path) -> None:
         settings_of(5, {"wall.law": "half_sample"}),
         settings_of(6, {"limits.speed_rad_s": 0.5}),
     ]
-    together = run_together(many, tmp_path / "run")
+    together = run_all(many, tmp_path / "run")
     (trip,) = together[0].outcome.trips
     assert trip.startswith("node 6: cycle ")
     assert "beyond limits.speed_rad_s" in trip
@@ -82,6 +87,6 @@ def test_trip_of_one_takes_the_torque_from_all(tmp_path: Path) -> None:
 )
 def test_what_cannot_run_together(tmp_path: Path, second: Settings, message: str) -> None:
     with pytest.raises(ConfigError) as error:
-        run_together([settings_of(5), second], tmp_path / "run")
+        run_all([settings_of(5), second], tmp_path / "run")
     assert str(error.value).startswith(message)
     assert not (tmp_path / "run").exists()

@@ -19,7 +19,6 @@ from commands import config_file, torque_is_on
 
 import canwall.record.recorder
 import canwall.record.writer
-import canwall.run.running
 from canwall import cli, config
 from canwall.drive import DriveState, state_of
 
@@ -154,7 +153,7 @@ def light() -> Iterator[None]:
     Neither has to do with the bus, and each takes an emulated processor ten seconds.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(canwall.run.running, "plot_run", lambda folder: None)
+        patch.setattr(canwall.record.Recorder, "draw", lambda recorder: [])
         patch.setattr(canwall.record.recorder.subprocess, "Popen", _ForkedWriter)
         yield
 
@@ -163,18 +162,20 @@ class _ForkedWriter:
     """What the record uses of a `subprocess.Popen` of its writer."""
 
     def __init__(self, command: list[str], **_: object) -> None:
-        assert command[1:3] == ["-m", "canwall.record.writer"]
-        its_input, self._input = os.pipe()
-        self._output, its_output = os.pipe()
+        assert command[1:4] == ["-P", "-m", "canwall.record.writer"]
+        its_input, ours = os.pipe()
+        theirs, its_output = os.pipe()
+        self.stdin = open(ours, "wb", buffering=0)  # noqa: SIM115 (closed by __exit__)
+        self.stdout = open(theirs, "rb", buffering=0)  # noqa: SIM115
         with _fork_is_safe():
             self._pid = os.fork()
         if self._pid == 0:
             os.setsid()
             os.dup2(its_input, 0)
             os.dup2(its_output, 1)
-            for descriptor in (its_input, self._input, self._output, its_output):
+            for descriptor in (its_input, ours, theirs, its_output):
                 os.close(descriptor)
-            sys.argv = command[2:]
+            sys.argv = command[3:]
             sys.stdin, sys.stdout = open(0), open(1, "w")  # noqa: SIM115 (until the process ends)
             try:
                 canwall.record.writer.main()
@@ -183,12 +184,13 @@ class _ForkedWriter:
         os.close(its_input)
         os.close(its_output)
 
-    def communicate(self, timeout: float | None = None) -> tuple[bytes, None]:
-        os.close(self._input)
-        with open(self._output, "rb") as output:
-            said = output.read()
+    def __enter__(self) -> "_ForkedWriter":
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.stdin.close()
+        self.stdout.close()
         os.waitpid(self._pid, 0)
-        return said, None
 
     def kill(self) -> None:
         os.kill(self._pid, signal.SIGKILL)

@@ -1,0 +1,137 @@
+"""Columns of a run's record, each declared once.
+
+The row that the cycle fills (`ROW`), the schema of signals.parquet with units and meanings as
+metadata, and the table of the documentation all come from `COLUMNS`. A new column is a line there
+and the line in the cycle that fills it.
+"""
+
+import json
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+class Phase(IntEnum):
+    """What a cycle was for."""
+
+    ENABLING = 0
+    RENDERING = 1
+    LEAVING = 2
+    MEASURING = 3
+
+
+class Column(NamedTuple):
+    """One column.
+
+    Attributes:
+        name: Name in a row and in the files.
+        dtype: NumPy's type of it in a row.
+        unit: Unit, empty where there is none.
+        meaning: One line for the metadata and the documentation.
+        names_law: The row holds an index into the laws of the run, the files hold the law's name.
+        by_clock: Decided by the clock of the machine; all others are the same from run to run.
+    """
+
+    name: str
+    dtype: str
+    unit: str
+    meaning: str
+    names_law: bool = False
+    by_clock: bool = False
+
+
+_PHASES = ", ".join(f"{phase.value} {phase.name.lower()}" for phase in Phase)
+
+#: One cycle. `position_rad` and what is called torque have the sign of the drive's axis; y, v, d,
+#: force and stiffness are the wall's: y < 0 inside it, force > 0 out of it.
+COLUMNS = (
+    Column("j", "i8", "", "SYNC count, from 0"),
+    Column("t_s", "f8", "s", "nominal time of the SYNC: j times the cycle"),
+    Column("phase", "u1", "", f"what the cycle was for: {_PHASES}"),
+    Column("received", "?", "", "whether the TPDO of this SYNC came in time"),
+    Column("counts", "i4", "count", "position actual value, 0x6064"),
+    Column("statusword", "u2", "", "statusword, 0x6041"),
+    Column("controlword", "u2", "", "controlword as sent, 0x6040"),
+    Column("position_rad", "f8", "rad", "position of the drive's axis"),
+    Column("y", "f8", "rad", "position relative to the wall as sampled; negative inside"),
+    Column("y_est", "f8", "rad", "the same, estimated for the instant at which the force acts"),
+    Column("v_est", "f8", "rad/s", "velocity, estimated for that instant"),
+    Column("d_est", "f8", "N·m", "bias force, estimated: what else moves the handle"),
+    Column("force", "f8", "N·m", "force that the law demands, positive out of the wall"),
+    Column("torque_cmd_per_mille", "i2", "‰ of rated torque", "target torque as sent, 0x6071"),
+    Column("torque_cmd", "f8", "N·m", "the same as torque, drive's axis"),
+    Column("torque_actual", "f8", "N·m", "torque actual value, 0x6077, drive's axis"),
+    Column("torque_applied", "f8", "N·m", "torque in force until the next SYNC, drive's axis"),
+    Column("force_applied", "f8", "N·m", "the same as force, positive out of the wall"),
+    Column("law", "u1", "", "law of the wall", names_law=True),
+    Column("stiffness", "f8", "N·m/rad", "stiffness of the wall"),
+    Column("damping", "f8", "N·m·s/rad", "damping of the wall"),
+    Column("wall_position_rad", "f8", "rad", "position of the wall on the drive's axis"),
+    Column("sync_interval_s", "f8", "s", "time since the SYNC before, measured", by_clock=True),
+    Column("latency_s", "f8", "s", "time from reception of the TPDO to the RPDO", by_clock=True),
+)
+
+#: One cycle as the cycle fills it and as the ring carries it.
+ROW = np.dtype([(column.name, column.dtype) for column in COLUMNS], align=True)
+
+#: Columns that the clock of the machine decides; all others are the same from run to run.
+TIMING_COLUMNS = tuple(column.name for column in COLUMNS if column.by_clock)
+
+
+def column_table() -> str:
+    """The columns as a Markdown table, for the documentation."""
+    lines = ["| column | type | unit | meaning |", "|---|---|---|---|"]
+    for column in COLUMNS:
+        kind = "string" if column.names_law else np.dtype(column.dtype).name
+        lines.append(f"| `{column.name}` | {kind} | {column.unit} | {column.meaning} |")
+    return "\n".join(lines) + "\n"
+
+
+def schema(laws: Sequence[str]) -> "pa.Schema":
+    """Schema of signals.parquet for a run with these laws.
+
+    A field's metadata are `unit` and `description`; the schema's are `laws`, as JSON.
+    """
+    import pyarrow as pa
+
+    fields = [
+        pa.field(
+            column.name,
+            pa.dictionary(pa.uint8(), pa.string())
+            if column.names_law
+            else pa.from_numpy_dtype(np.dtype(column.dtype)),
+            metadata={"unit": column.unit, "description": column.meaning},
+        )
+        for column in COLUMNS
+    ]
+    return pa.schema(fields, metadata={"laws": json.dumps(list(laws))})
+
+
+def record_batch(rows: NDArray[np.void], laws: Sequence[str]) -> "pa.RecordBatch":
+    """Rows of dtype ROW, shape (n,), as Arrow has them.
+
+    Made from their bytes, because `pyarrow.array` imports pandas to look at what it is given.
+    """
+    import pyarrow as pa
+
+    def array(kind: "pa.DataType", count: int, *buffers: Any) -> "pa.Array":
+        return pa.Array.from_buffers(kind, count, [None, *map(pa.py_buffer, buffers)])
+
+    def column(kind: "pa.DataType", values: NDArray[Any]) -> "pa.Array":
+        if pa.types.is_dictionary(kind):
+            return pa.DictionaryArray.from_arrays(column(kind.index_type, values), names)
+        if pa.types.is_boolean(kind):
+            values = np.packbits(values, bitorder="little")
+        return array(kind, len(rows), np.ascontiguousarray(values))
+
+    encoded = [law.encode() for law in laws]
+    ends = np.cumsum([0, *map(len, encoded)], dtype=np.int32)
+    names = array(pa.string(), len(laws), ends, b"".join(encoded))
+    fields = schema(laws)
+    return pa.RecordBatch.from_arrays([column(f.type, rows[f.name]) for f in fields], schema=fields)
