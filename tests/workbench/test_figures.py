@@ -14,7 +14,8 @@ import pytest
 from matplotlib.image import imread
 from numpy.typing import NDArray
 
-from canwall import cli, metrics
+from canwall import cli
+from canwall.analysis import metrics
 from canwall.errors import InputError, RunFailedError
 from canwall.walls import LAWS
 from canwall.workbench import CONTINUOUS, Ball, bounced, continuous_ball, on_the_drive
