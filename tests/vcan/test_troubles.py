@@ -17,7 +17,7 @@ from socketcan import (
     wait_for,
 )
 
-from canwall.drive import reason
+from canwall.bus import reason
 
 _SLOW = SLOW | UNTIL_STOPPED
 
