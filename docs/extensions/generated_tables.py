@@ -1,7 +1,6 @@
 """Tables that are read from the code while the site is built, so that they cannot go stale."""
 
 import inspect
-import re
 import types
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -13,10 +12,10 @@ from docutils import nodes
 from pydantic import BaseModel
 from sphinx.util.docutils import SphinxDirective
 
-from canwall.analysis import DESCRIBED
+from canwall.analysis import MEASURE_DESCRIPTIONS
 from canwall.cli import app as commands
 from canwall.config import Settings
-from canwall.record import ring
+from canwall.record import column_table
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
@@ -163,14 +162,8 @@ class RecordedColumns(_Generated):
     """The columns of `signals.parquet`: `{recorded-columns}`."""
 
     def lines(self) -> Iterator[str]:
-        """A table of name, type, and unit and meaning as ROW has them in its comments."""
-        source = inspect.getsource(ring).partition("ROW = ")[2].partition("align=True")[0]
-        comments = dict(re.findall(r'\("(\w+)", "[^"]+"\),(?:  # (.*))?', source))
-        rows = [
-            (f"`{name}`", "text" if name == "law" else f"{ring.ROW[name]}", comments[name])
-            for name in ring.ROW.names or ()
-        ]
-        yield from _table(("column", "type", "meaning"), rows)
+        """The table of their declarations."""
+        yield column_table()
 
 
 class SweepMeasures(_Generated):
@@ -178,7 +171,9 @@ class SweepMeasures(_Generated):
 
     def lines(self) -> Iterator[str]:
         """A table of name, unit and meaning."""
-        rows = [(f"`{name}`", unit, meaning) for name, (unit, meaning) in DESCRIBED.items()]
+        rows = [
+            (f"`{name}`", unit, meaning) for name, (unit, meaning) in MEASURE_DESCRIPTIONS.items()
+        ]
         yield from _table(("variable", "unit", "meaning"), rows)
 
 
