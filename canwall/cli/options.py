@@ -1,12 +1,12 @@
 """Arguments and options that several commands have, and the settings that they lead to."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from canwall import config
-from canwall.config import Settings
+if TYPE_CHECKING:
+    from canwall.config import Settings
 
 ConfigArgument = Annotated[
     Path | None, typer.Argument(metavar="CONFIG", help="A TOML file; without: config/sim.toml.")
@@ -20,8 +20,10 @@ NoWatchdogOption = Annotated[
 ]
 
 
-def settings_from(path: Path | None, **overrides: Any) -> Settings:
+def settings_from(path: Path | None, **overrides: Any) -> "Settings":
     """The settings of a file, with what was given on the command line instead."""
+    from canwall import config  # pydantic takes long to import: not for --help
+
     dotted = {
         key.replace("__", "."): value for key, value in overrides.items() if value is not None
     }

@@ -1,5 +1,6 @@
 """A program of commands, `canwall` or a script's: how it shows its help, and how it is run."""
 
+import gc
 import sys
 from typing import Any, NoReturn
 
@@ -20,4 +21,8 @@ def make_program(**settings: Any) -> typer.Typer:
 
 def run_program(program: typer.Typer) -> NoReturn:
     """By the command line; ends the process with the exit code."""
-    sys.exit(guarded(lambda: program(standalone_mode=False)))
+    code = guarded(lambda: program(standalone_mode=False))
+    # At its end Python looks for garbage among all that was ever imported, for longer than a
+    # command may take; all of it goes with the process.
+    gc.freeze()
+    sys.exit(code)

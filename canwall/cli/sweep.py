@@ -9,7 +9,6 @@ import typer
 from canwall.cli.ending import StoppedError
 from canwall.cli.options import settings_from
 from canwall.cli.output import ShownProgress, console
-from canwall.config import absolute_law
 from canwall.errors import InputError, RunFailedError
 
 
@@ -52,6 +51,8 @@ def sweep(
         if not equals or name in given:
             raise InputError(f"--axis {name}: has to be NAME=VALUES, each name once")
         given[name] = values
+    from canwall.config import absolute_law
+
     named = {
         "law": law and [absolute_law(name, Path()) for name in law],
         "stiffness": stiffness,

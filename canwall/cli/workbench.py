@@ -7,7 +7,6 @@ from typing import Annotated
 import typer
 
 from canwall.cli.output import ShownProgress, console
-from canwall.config import absolute_law
 from canwall.errors import InputError
 
 
@@ -30,6 +29,7 @@ def ball(
     option: Annotated[list[str] | None, typer.Option(help="Law's option, NAME=VALUE.")] = None,
 ) -> int:
     """A ball bouncing on a floor that is the wall: exact state, no delay, held force."""
+    from canwall.config import absolute_law
     from canwall.workbench import CONTINUOUS, Ball, bounced, write_ball
 
     ball = Ball(
