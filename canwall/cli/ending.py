@@ -1,9 +1,9 @@
 """End of every command: exit codes, and errors as one line."""
 
+import sys
 from collections.abc import Callable
 
 import typer
-from can import CanError
 
 from canwall.cli.output import say
 from canwall.errors import InputError, RunFailedError
@@ -32,7 +32,15 @@ def guarded(command: Callable[[], object]) -> int:
     except InputError as error:
         say(str(error))
         return BAD_INPUT
-    except (RunFailedError, CanError) as error:
+    except Exception as error:
+        if not isinstance(error, RunFailedError) and not _is_bus_error(error):
+            raise
         say(str(error))
         return FAILED
     return result if isinstance(result, int) else 0
+
+
+def _is_bus_error(error: Exception) -> bool:
+    """True if python-can raised it, which takes long to import: not at all if nobody has."""
+    can = sys.modules.get("can")
+    return can is not None and isinstance(error, can.CanError)

@@ -1,12 +1,12 @@
 """Arguments and options shared by several commands, and the settings made from them."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from canwall import config
-from canwall.config import Settings
+if TYPE_CHECKING:
+    from canwall.config import Settings
 
 ConfigArgument = Annotated[
     Path | None, typer.Argument(metavar="CONFIG", help="A TOML file; without: config/sim.toml.")
@@ -20,11 +20,13 @@ NoWatchdogOption = Annotated[
 ]
 
 
-def settings_from(path: Path | None, **overrides: Any) -> Settings:
+def settings_from(path: Path | None, **overrides: Any) -> "Settings":
     """Load a configuration, by default config/sim.toml, with keys given on the command line.
 
     Overrides have "__" for the dot of a key; None stands for an option that was not given.
     """
+    from canwall import config  # pydantic takes long to import: not for --help
+
     dotted = {
         key.replace("__", "."): value for key, value in overrides.items() if value is not None
     }

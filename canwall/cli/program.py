@@ -1,5 +1,6 @@
 """Construction and execution of a program of commands: `canwall`, or one of its groups."""
 
+import gc
 import sys
 from typing import Any, NoReturn
 
@@ -20,4 +21,8 @@ def make_program(**settings: Any) -> typer.Typer:
 
 def run_program(program: typer.Typer) -> NoReturn:
     """Run the program with the arguments of the process and exit with its exit code."""
-    sys.exit(guarded(lambda: program(standalone_mode=False)))
+    code = guarded(lambda: program(standalone_mode=False))
+    # At its end Python looks for garbage among all that was ever imported, for longer than a
+    # command may take; all of it goes with the process.
+    gc.freeze()
+    sys.exit(code)

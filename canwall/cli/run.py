@@ -1,16 +1,19 @@
 """Commands that render walls: `run`, `change` during a run, and the simulated `drive`."""
 
+import gc
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
 
-from canwall import config
 from canwall.cli.ending import FAILED, INTERRUPTED
 from canwall.cli.options import ConfigArgument, EdsOption, NoWatchdogOption, absolute, settings_from
 from canwall.cli.output import ProgressDisplay, console, say
-from canwall.config import ConfigError, Settings, absolute_law
+from canwall.errors import ConfigError
+
+if TYPE_CHECKING:
+    from canwall.config import Settings
 
 
 def run(
@@ -37,9 +40,11 @@ def run(
     Several files: as many drives on one bus, each with its wall, on one SYNC. With --law, changes
     of law in [[schedule]] are skipped.
     """
+    from canwall import config
+
     files = config_files or [config.shipped("config/sim.toml")]
     overrides = {
-        "wall__law": law and absolute_law(law, Path()),
+        "wall__law": law and config.absolute_law(law, Path()),
         "wall__stiffness_nm_per_rad": stiffness,
         "wall__damping_nm_s_per_rad": damping,
         "run__duration_s": duration,
@@ -53,6 +58,7 @@ def run(
     with ProgressDisplay() as display, start_recorders(len(many)) as recorders:
         from canwall.run import run_together  # while the writers of the record start
 
+        gc.freeze()  # modules stay; the collector need not visit them
         results = run_together(many, recorders, output, display.report, display.advance)
     for result in results:
         console.print(_strike_table(result.summary["strikes"]))
@@ -71,7 +77,7 @@ def run(
     return INTERRUPTED if outcome.interrupted else 0
 
 
-def _run_settings(path: Path, overrides: dict[str, Any]) -> Settings:
+def _run_settings(path: Path, overrides: dict[str, Any]) -> "Settings":
     settings = settings_from(path, **overrides)
     if overrides["wall__law"] is not None:
         kept = tuple(change.model_copy(update={"law": None}) for change in settings.schedule)

@@ -9,7 +9,6 @@ import typer
 from canwall.cli.ending import StoppedError
 from canwall.cli.options import ConfigArgument, settings_from
 from canwall.cli.output import ProgressDisplay, console
-from canwall.config import absolute_law
 from canwall.errors import InputError, RunFailedError
 
 
@@ -58,6 +57,8 @@ def sweep(
     """Sweep strikes over any axes and judge each wall, or search the K-limit at each point."""
     if workers is not None and dask is not None:
         raise InputError("--workers and --dask: keep one; a cluster has workers of its own")
+    from canwall.config import absolute_law
+
     laws = [absolute_law(name, Path()) for name in law or []]
     if table:
         unused = {

@@ -7,7 +7,6 @@ from typing import Annotated
 import typer
 
 from canwall.cli.output import ProgressDisplay, console
-from canwall.config import absolute_law
 from canwall.errors import InputError
 
 
@@ -30,6 +29,7 @@ def ball(
     option: Annotated[list[str] | None, typer.Option(help="Law's option, NAME=VALUE.")] = None,
 ) -> int:
     """Simulate a ball that bounces on the wall as its floor: exact state, no delay, held force."""
+    from canwall.config import absolute_law
     from canwall.workbench import CONTINUOUS, Ball, simulate_ball, write_ball
 
     ball = Ball(

@@ -7,6 +7,7 @@ while the master sets up the drive, and can load the plotting library meanwhile.
 """
 
 import contextlib
+import gc
 import json
 import os
 import select
@@ -182,8 +183,7 @@ def main() -> None:
                 _answer(error)
             while orders.readline():
                 _answer(_draw(Path(order["folder"])))
-    sys.stderr.flush()
-    os._exit(0)  # everything is written; to take libraries down properly takes longer than to write
+    gc.freeze()  # the master waits for the end: no search for garbage in all that was imported
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from commands import Record, command
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from canwall.config import ConfigError
@@ -27,7 +28,9 @@ def copied(four_strikes: Record, tmp_path: Path) -> RunFolder:
 @pytest.fixture
 def figure(copied: RunFolder, monkeypatch: pytest.MonkeyPatch) -> Figure:
     drawn: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda self, path: drawn.append(self))
+    monkeypatch.setattr(
+        FigureCanvasAgg, "print_png", lambda self, *args, **options: drawn.append(self.figure)
+    )
     plot_run(copied)
     (figure,) = drawn
     return figure
