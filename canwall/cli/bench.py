@@ -9,7 +9,13 @@ from rich.markup import escape
 from rich.table import Table
 
 from canwall.cli.ending import FAILED, StoppedError
-from canwall.cli.options import ConfigArgument, EdsOption, NoWatchdogOption, absolute, settings_from
+from canwall.cli.options import (
+    ConfigArgument,
+    EdsOption,
+    NoWatchdogOption,
+    absolute_path,
+    settings_from,
+)
 from canwall.cli.output import ProgressDisplay, console, errors, say
 
 if TYPE_CHECKING:
@@ -27,7 +33,7 @@ def doctor(
     """
     settings = settings_from(
         config_file,
-        drive__eds=absolute(eds),
+        drive__eds=absolute_path(eds),
         drive__accept_no_watchdog=accept_no_watchdog or None,
     )
     from canwall.bench import Findings, examine
@@ -75,7 +81,7 @@ def latency(
     settings = settings_from(
         config_file,
         bus__exchange=exchange,
-        drive__eds=absolute(eds),
+        drive__eds=absolute_path(eds),
         drive__accept_no_watchdog=accept_no_watchdog or None,
     )
     from canwall.bench import measure_latency

@@ -17,7 +17,7 @@ class StoppedError(Exception):
 
 
 def guarded(command: Callable[[], object]) -> int:
-    """Run a command and return its exit code; an error becomes one line, anything else is a bug."""
+    """Run a command and return its exit code; errors become one line each, a traceback is a bug."""
     try:
         result = command()
     except StoppedError as interrupted:

@@ -33,6 +33,6 @@ def settings_from(path: Path | None, **overrides: Any) -> "Settings":
     return config.load(path or config.shipped("config/sim.toml"), dotted)
 
 
-def absolute(path: Path | None) -> Path | None:
+def absolute_path(path: Path | None) -> Path | None:
     """Resolve a path of the command line, relative to the working directory."""
     return path and path.resolve()

@@ -8,7 +8,13 @@ import typer
 from rich.table import Table
 
 from canwall.cli.ending import FAILED, INTERRUPTED
-from canwall.cli.options import ConfigArgument, EdsOption, NoWatchdogOption, absolute, settings_from
+from canwall.cli.options import (
+    ConfigArgument,
+    EdsOption,
+    NoWatchdogOption,
+    absolute_path,
+    settings_from,
+)
 from canwall.cli.output import ProgressDisplay, console, say
 from canwall.errors import ConfigError
 
@@ -48,7 +54,7 @@ def run(
         "wall__stiffness_nm_per_rad": stiffness,
         "wall__damping_nm_s_per_rad": damping,
         "run__duration_s": duration,
-        "drive__eds": absolute(eds),
+        "drive__eds": absolute_path(eds),
         "drive__accept_no_watchdog": accept_no_watchdog or None,
         "drive__restore": restore or None,
     }
@@ -109,7 +115,7 @@ def drive(
     eds: EdsOption = None,
 ) -> int:
     """Simulate a drive, alone on the bus of CONFIG, until stopped."""
-    settings = settings_from(config_file, drive__eds=absolute(eds))
+    settings = settings_from(config_file, drive__eds=absolute_path(eds))
     if real_time and settings.simulation is not None:
         simulation = settings.simulation.model_copy(update={"real_time": True})
         settings = settings.model_copy(update={"simulation": simulation})

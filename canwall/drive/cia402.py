@@ -104,7 +104,7 @@ _RESETS = 3
 
 
 class Enabling:
-    """Way to OPERATION ENABLED from any state, a controlword for each new statusword."""
+    """Sequence of controlwords to OPERATION ENABLED from any state, one per new statusword."""
 
     def __init__(self) -> None:
         self._controlword: int = Controlword.DISABLE_VOLTAGE

@@ -98,7 +98,7 @@ def enter_mode(node: DriveNode, mode: int) -> None:
             )
 
 
-def steepest_slope(node: DriveNode) -> int:
+def set_steepest_slope(node: DriveNode) -> int:
     """Set 0x6087 to the greatest value that the drive accepts, so that the torque follows at once.
 
     Returns the value [per mille of the rated torque per second]. Raises DriveError.

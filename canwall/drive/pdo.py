@@ -91,8 +91,8 @@ def configure_tpdo(
     Raises:
         DriveError: If no TPDO can carry the needed objects.
     """
-    choices = _choices(node, needed, wanted)
-    layout = _mapped(node, od.TPDO_COMMUNICATION, choices, notes)
+    choices = _mapping_choices(node, needed, wanted)
+    layout = _map_pdo(node, od.TPDO_COMMUNICATION, choices, notes)
     _set_times(node, layout.communication, notes)
     node.change(layout.communication, 2, EVERY_SYNC)
     node.confirm(layout.communication, 2, EVERY_SYNC)
@@ -113,7 +113,7 @@ def configure_rpdo(
     Raises:
         DriveError: If no RPDO can carry the objects, or none in the way it is to be effective.
     """
-    layout = _mapped(node, od.RPDO_COMMUNICATION, [list(needed)], notes)
+    layout = _map_pdo(node, od.RPDO_COMMUNICATION, [list(needed)], notes)
     _set_times(node, layout.communication, notes)
     _set_effect(node, layout.communication, immediate)
     return _switch_on(node, layout)
@@ -133,7 +133,9 @@ def while_off(node: DriveNode, communication: int) -> Iterator[None]:
         node.change(communication, 1, cob_id)
 
 
-def _choices(node: DriveNode, needed: Sequence[int], wanted: Sequence[int]) -> list[list[int]]:
+def _mapping_choices(
+    node: DriveNode, needed: Sequence[int], wanted: Sequence[int]
+) -> list[list[int]]:
     """Return the possible mappings, the fullest first."""
     chosen = list(needed)
     choices = [chosen]
@@ -147,7 +149,7 @@ def _choices(node: DriveNode, needed: Sequence[int], wanted: Sequence[int]) -> l
     return choices
 
 
-def _mapped(node: DriveNode, first: int, choices: list[list[int]], notes: list[str]) -> PdoLayout:
+def _map_pdo(node: DriveNode, first: int, choices: list[list[int]], notes: list[str]) -> PdoLayout:
     """Map the first PDO with the fullest mapping that the drive accepts, else find a fixed one.
 
     A PDO whose mapping was written is left switched off.
@@ -165,16 +167,16 @@ def _mapped(node: DriveNode, first: int, choices: list[list[int]], notes: list[s
             notes.append(f"mapped less than there is room for: {refusals[-1]}")
         return layout
     needed = choices[-1]
-    present = list(_present(node, first))
+    present = list(_read_pdos(node, first))
     for layout in present:
         if layout.carries(needed):
             notes.append(f"0x{layout.communication:04X} is used as the drive has it: {refusals[0]}")
             return layout
     # The last refusal is that of the smallest mapping.
-    raise DriveError(f"{refusals[-1]}; {_missing(first, needed, present)}")
+    raise DriveError(f"{refusals[-1]}; {_missing_objects(first, needed, present)}")
 
 
-def _missing(first: int, needed: Sequence[int], present: Sequence[PdoLayout]) -> str:
+def _missing_objects(first: int, needed: Sequence[int], present: Sequence[PdoLayout]) -> str:
     kind = "TPDO" if first == od.TPDO_COMMUNICATION else "RPDO"
     wanted = " and ".join(f"0x{index:04X}" for index in needed)
     best = max(present, key=lambda pdo: sum(pdo.field(i) is not None for i in needed), default=None)
@@ -226,7 +228,7 @@ def _layout(communication: int, cob_id: int, entries: Sequence[int]) -> PdoLayou
     return PdoLayout(cob_id & _CAN_ID, tuple(fields), communication)
 
 
-def _present(node: DriveNode, first: int) -> Iterator[PdoLayout]:
+def _read_pdos(node: DriveNode, first: int) -> Iterator[PdoLayout]:
     """Read the PDOs of one direction as the drive has them."""
     for communication in range(first, first + _MAPPING_OFFSET):
         mapping = communication + _MAPPING_OFFSET
@@ -239,7 +241,7 @@ def tpdos_on_sync(node: DriveNode) -> list[PdoLayout]:
     """Return all TPDOs that the drive sends with every SYNC or with some. Raises DriveError."""
     return [
         layout
-        for layout in _present(node, od.TPDO_COMMUNICATION)
+        for layout in _read_pdos(node, od.TPDO_COMMUNICATION)
         if not node.read(layout.communication, 1) & _INVALID
         and 1 <= node.read(layout.communication, 2) < _SYNCHRONOUS.stop
     ]

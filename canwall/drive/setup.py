@@ -10,7 +10,7 @@ from canwall.config import Drive as DriveSettings
 from canwall.drive import objects as od
 from canwall.drive.cia402 import Controlword, DriveState, state_of, status_text
 from canwall.drive.identity import Identity, identify
-from canwall.drive.mode import Mode, select_mode, steepest_slope
+from canwall.drive.mode import Mode, select_mode, set_steepest_slope
 from canwall.drive.node import DriveError, DriveNode
 from canwall.drive.pdo import PdoLayout, configure_rpdo, configure_tpdo, with_constant
 from canwall.drive.scales import Scales, read_scales
@@ -103,7 +103,7 @@ def set_up(
     scales = read_scales(node, settings)
     mode = select_mode(node, settings.mode)
     if mode.number == od.PROFILE_TORQUE and node.has(od.TORQUE_SLOPE):
-        steepest_slope(node)
+        set_steepest_slope(node)
     node.write(od.TARGET_TORQUE, 0, 0)
     node.confirm(od.TARGET_TORQUE, 0, 0)
     _set_interpolation_period(node, bus.cycle_s, notes)

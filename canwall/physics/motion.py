@@ -112,7 +112,7 @@ def _is_inside(plant: Record, y: float, v: float, pull: float) -> bool:
 
 @compiled
 def _upper_edge(plant: Record, index: int) -> float:
-    """Return the upper edge of half a cog, by the only formula, so that edges compare exactly."""
+    """Return the upper edge of half a cog; a single formula lets edges compare exactly."""
     return (index + 0.5) * (0.5 * plant.cog_pitch) - plant.cog_origin
 
 

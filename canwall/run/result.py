@@ -35,7 +35,7 @@ class RunResult:
     remarks: list[str]
 
 
-def result_of(
+def write_result(
     axis: WallAxis,
     exchange: Exchange,
     monitor: BusMonitor,

@@ -21,7 +21,7 @@ from canwall.run.assembly import (
 )
 from canwall.run.buses import on_the_bus
 from canwall.run.changes import open_to_changes
-from canwall.run.result import RunResult, remarks_on, result_of
+from canwall.run.result import RunResult, remarks_on, write_result
 from canwall.run.stopping import stop_on_signals
 
 
@@ -113,7 +113,7 @@ def run_together(
         remarks = [*remarks_on(axis.setup, axis.settings), *not_restored.get(axis.name, [])]
         remarks += outcome.notes if axis is axes[0] else []
         results.append(
-            result_of(axis, exchange, monitor, machine, folder, outcome, of_axis, remarks)
+            write_result(axis, exchange, monitor, machine, folder, outcome, of_axis, remarks)
         )
     report("drawing")
     for recorder, result in zip(recorders, results, strict=True):

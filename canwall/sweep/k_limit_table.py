@@ -1,4 +1,4 @@
-"""Table of K-limits in Markdown: laws by operators, for a matched model and for the drive's alone.
+"""Table of K-limits in Markdown: every law with every operator, for two models of the laws.
 
 Each cell has K [N·m/rad], K·T²/m in bold (at the best B·T/m for a law with a damper), and the
 ratios to the standard wall and to the best damped one.

@@ -40,7 +40,10 @@ class Cluster:
         """first: where its processes look for packages before they look anywhere else."""
         self.workers: list[subprocess.Popen[bytes]] = []
         self._first = first
-        self._environment = os.environ | ({"PYTHONPATH": str(first)} if first else {})
+        self._environment = dict(os.environ)
+        if first is not None:
+            others = os.environ.get("PYTHONPATH", "")
+            self._environment["PYTHONPATH"] = f"{first}{os.pathsep}{others}".rstrip(os.pathsep)
         self._log = (folder / "log").open("wb")
         file = folder / "scheduler.json"
         self.scheduler = self._start(

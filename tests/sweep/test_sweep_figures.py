@@ -126,7 +126,7 @@ def test_limits_of_one_condition_and_what_cannot_be_drawn(tmp_path: Path) -> Non
     with pytest.raises(InputError, match="cannot be written"):
         write_sweep_figures(limits, tmp_path / "nowhere" / "limits")
     point = swept(tmp_path / "point.nc", stiffness=[10.0])
-    with pytest.raises(InputError, match="one point alone"):
+    with pytest.raises(InputError, match="has a single point"):
         write_sweep_figures(point, tmp_path / "point")
 
 
