@@ -1,5 +1,8 @@
 """A simulated drive at the other end of a socket pair, in steady operation without Python."""
 
+import functools
+from typing import Any
+
 import numpy as np
 from numba import cfunc, types
 from numpy.typing import NDArray
@@ -73,10 +76,16 @@ def serve(servers: NDArray[np.void]) -> int:
     return 1
 
 
-@cfunc(types.int64(types.uint64), cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _serve_at(address: int) -> int:
     """Call `serve` for the record at an address."""
     return serve(elements(address, 1, SERVER))
+
+
+@functools.cache
+def _serve_function() -> Any:
+    """Return `_serve_at` as a C function, compiled or loaded when it is first wanted."""
+    signature = types.int64(types.uint64)
+    return cfunc(signature, cache=True, error_model="numpy")(_serve_at)
 
 
 class SocketRunner(BusRunner):
@@ -90,7 +99,7 @@ class SocketRunner(BusRunner):
         record["drive"] = drive.drive.state.record.ctypes.data
         record["descriptor"] = bus.fileno()
         place_port(record["port"][0])
-        self.compiled = CFunction(int(_serve_at.address), record.ctypes.data)
+        self.compiled = CFunction(int(_serve_function().address), record.ctypes.data)
         """What compiled code calls instead of `poll`."""
 
     def poll(self) -> None:
