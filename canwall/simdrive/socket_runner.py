@@ -82,7 +82,8 @@ def _serve_at(address: int) -> int:
 
 
 @functools.cache
-def _compiled_serve_at() -> Any:
+def _serve_function() -> Any:
+    """Return `_serve_at` as a C function, compiled or loaded at its first use."""
     return compiled_for_c(_serve_at, types.int64(types.uint64))
 
 
@@ -97,7 +98,7 @@ class SocketRunner(BusRunner):
         record["drive"] = drive.drive.state.record.ctypes.data
         record["descriptor"] = bus.fileno()
         place_port(record["port"][0])
-        self.compiled = CFunction(int(_compiled_serve_at().address), record.ctypes.data)
+        self.compiled = CFunction(int(_serve_function().address), record.ctypes.data)
         """What compiled code calls instead of `poll`."""
 
     def poll(self) -> None:

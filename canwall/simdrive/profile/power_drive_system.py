@@ -69,6 +69,7 @@ class PowerDriveSystem:
         Raises:
             DictionaryError: one of them is of no use.
         """
+        self._state = state.fields
         self._emcy = emcy
         self._hardware = hardware
         self._feedback = Feedback(dictionary, state, hardware, motion)
@@ -319,6 +320,8 @@ class PowerDriveSystem:
         self._dc_link_voltage.value = round(1000.0 * volts)
 
     def _show_status(self) -> None:
+        # Whatever changes here, the drive looks anew whether `steady.take` may go on.
+        self._state.steady = False
         machine = self.state_machine
         status: int = machine.state.value
         if machine.state is not PdsState.NOT_READY_TO_SWITCH_ON:

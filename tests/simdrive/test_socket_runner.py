@@ -1,14 +1,22 @@
-"""The drive that answers in compiled code: frame for frame the drive that answers in Python."""
+"""The drive on a socket pair: frame for frame the drive on python-can's virtual bus."""
 
+import ctypes
+import struct
+import time
 from typing import Any
 
 import numpy as np
 import pytest
 from rig import settings_with
+from simdrive_bench import EMCY, HEARTBEAT, RPDO, SYNC, TPDO
+from test_steady import enabled
 
+from canwall.bus import DataFrame, socket_pair
+from canwall.config import Simulation
 from canwall.cycle import WallAxis, run_laws
 from canwall.record import TIMING_COLUMNS, Ring
 from canwall.run import drive_dictionary, make_axis, make_exchange, on_the_bus, render
+from canwall.simdrive import SocketRunner
 
 CYCLES = 1200
 #: What the drive's end of a PDO, its state machine and SDO are for; PDOs are compared by rows.
@@ -64,7 +72,7 @@ def assert_same(ours: Any, theirs: Any) -> None:
         {"wall.law": "standard", "limits.torque_error_nm": 0.0, "simulation.overload_s": 0.02},
         {"wall.law": "mean_force", "simulation.current_bandwidth_hz": 500.0},
         {"wall.law": "half_sample", "simulation.velocity_filter_hz": 100.0},
-        # Not lent at all.
+        # Not in steady operation.
         {"wall.law": "half_sample", "simulation.torque_delay_cycles": 0.5},
     ],
 )
@@ -73,8 +81,8 @@ def test_frames_are_the_same(overrides: dict[str, Any]) -> None:
     theirs, their_pdos, their_polls, _ = rendered("python-can", overrides)
     assert_same(ours, theirs)
     assert our_pdos[: 3 * CYCLES] == their_pdos[: 3 * CYCLES]
-    lent = "simulation.torque_delay_cycles" not in overrides
-    assert (polls < their_polls / 4) == lent
+    steady = "simulation.torque_delay_cycles" not in overrides
+    assert (polls < their_polls / 4) == steady
 
 
 def test_drive_is_whole_for_those_who_ask_in_between() -> None:
@@ -89,3 +97,35 @@ def test_drive_is_whole_for_those_who_ask_in_between() -> None:
     # A synchronous RPDO has its effect at the next SYNC.
     assert target == rows["torque_cmd_per_mille"][j - 2] != 0
     assert np.all(np.diff(rows["j"]) == 1)
+
+
+def test_timers_go_on_in_steady_operation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Heartbeats every 10 ms, and EMCY 0x8250 once no RPDO has come for 40 ms."""
+    bench = enabled(Simulation())
+    bench.write(0x1017, 0, 10, 2)
+    bench.write(0x1402, 5, 40, 2)
+    bench.sync()
+    monkeypatch.setattr(bench.drive, "boot", list)  # it is up
+    master, slave = socket_pair()
+    with master, slave:
+        runner = SocketRunner(bench.drive, slave)
+        serve = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_uint64)(runner.compiled.address)
+        heard: list[tuple[int, bytes]] = []
+        polls = cycles = 0
+        begin_s = time.monotonic()
+        while (passed_s := time.monotonic() - begin_s) < 2.0 and EMCY not in dict(heard):
+            if passed_s < 0.1:
+                master.send(DataFrame(RPDO[3], struct.pack("<Hh", 0x0F, 10)))
+            master.send(DataFrame(SYNC, b""))
+            cycles += 1
+            if not serve(runner.compiled.state):
+                polls += 1
+                runner.poll()
+            while (message := master.recv(0)) is not None:
+                heard.append((message.arbitration_id, bytes(message.data)))
+    ids = [can_id for can_id, _ in heard]
+    assert ids.count(TPDO[3]) >= cycles - 1
+    assert ids.count(HEARTBEAT) >= 3
+    assert struct.unpack_from("<H", dict(heard)[EMCY])[0] == 0x8250
+    assert passed_s > 0.13
+    assert polls < cycles / 5
