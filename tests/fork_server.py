@@ -293,6 +293,8 @@ if __name__ == "__main__":
     del sys.path[0]  # this folder, which is of no program
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     load()
-    gc.collect()
-    gc.freeze()
-    serve(socket.socket(fileno=int(sys.argv[1])))
+    # Without a socket, all that is wanted is that the code is compiled.
+    if len(sys.argv) > 1:
+        gc.collect()
+        gc.freeze()
+        serve(socket.socket(fileno=int(sys.argv[1])))
