@@ -80,8 +80,8 @@ class _Compiled:
         functools.update_wrapper(self, function)
         self._function = function
 
-    def __call__(self, *args: Any) -> Any:
-        return self._dispatcher(*args)
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        return self._dispatcher(*args, **kwargs)
 
     @functools.cached_property
     def _dispatcher(self) -> Any:

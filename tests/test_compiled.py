@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import canwall
 from canwall.compiled import data_to_number, number_to_data
 
@@ -25,6 +27,7 @@ def fall(package: Path) -> str:
     return done.stdout.strip()
 
 
+@pytest.mark.slow
 def test_change_in_another_file_is_noticed(tmp_path: Path) -> None:
     source = Path(canwall.__file__).parent
     package = tmp_path / "canwall"

@@ -88,6 +88,7 @@ def test_a_file_of_another_kind(tmp_path: Path, name: str) -> None:
     assert refused(path).startswith("not a readable EDS or DCF: ")
 
 
+@pytest.mark.slow
 @BOUNDED
 @given(st.binary(max_size=200) | st.text(max_size=200).map(lambda text: text.encode()))
 def test_any_bytes(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:

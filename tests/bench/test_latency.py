@@ -61,6 +61,7 @@ def settings_of(exchange: str, overrides: dict[str, Any] | None = None) -> Setti
     return config.load(config.shipped("config/sim.toml"), given)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exchange", ["python-can", "native"])
 def test_measured_without_torque_and_put_back(exchange: str, drives: list[Listening]) -> None:
     told: list[tuple[str, float, float]] = []
@@ -258,6 +259,7 @@ def test_folder_that_cannot_be_made(tmp_path: Path) -> None:
 # The command
 
 
+@pytest.mark.slow
 def test_command_over_unixcan(start: Start, tmp_path: Path) -> None:
     file = config_file(
         tmp_path / "c.toml",
@@ -292,6 +294,7 @@ def test_bad_input(arguments: tuple[str, ...], said: str) -> None:
     assert said in line
 
 
+@pytest.mark.slow
 def test_ctrl_c(start: Start) -> None:
     running = start(COMMAND, "latency", "--duration", "3600", "--load", "1", "--exchange", "native")
     # Its ring is there: it has begun.

@@ -595,6 +595,7 @@ def test_socket_of_another_program_is_left_alone(channel: Path) -> None:
     assert channel.is_socket()
 
 
+@pytest.mark.slow
 def test_lock_held_by_who_does_not_listen(channel: Path) -> None:
     with open(f"{channel}.lock", "wb") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)

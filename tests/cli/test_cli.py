@@ -177,6 +177,7 @@ def nothing_but_boot_up(listener: VirtualBus) -> bool:
     return set(heard) <= {0x705}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
@@ -214,6 +215,7 @@ def test_bad_arguments(
     assert nothing_but_boot_up(listener)
 
 
+@pytest.mark.slow
 def test_bad_input_in_a_process_of_its_own(tmp_path: Path) -> None:
     done = command("run", "--law", "none", "--output", tmp_path / "run")
     assert done.returncode == 2
@@ -310,12 +312,14 @@ def on_a_terminal(*arguments: object) -> str:
     return written.decode()
 
 
+@pytest.mark.slow
 def test_progress_is_shown_on_a_terminal(tmp_path: Path) -> None:
     written = on_a_terminal("run", "--duration", 0.3, "--output", tmp_path / "run")
     assert "drawing" in written
     assert "of 0.3 s" in written
 
 
+@pytest.mark.slow
 def test_progress_makes_room_for_an_error(tmp_path: Path) -> None:
     written = on_a_terminal("run", "--law", "none", "--output", tmp_path / "run")
     erase_line = "\x1b[2K"

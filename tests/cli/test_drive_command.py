@@ -24,6 +24,7 @@ def drive_file(tmp_path: Path, channel: Path, fault: str) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_real_time_needs_no_sync(start: Start, tmp_path: Path, channel: Path) -> None:
     fault = 'kind = "silence"\nat_s = 0.05\nduration_s = 0.05'
     drive = start(COMMAND, "drive", drive_file(tmp_path, channel, fault), "--real-time")
@@ -35,6 +36,7 @@ def test_real_time_needs_no_sync(start: Start, tmp_path: Path, channel: Path) ->
     assert drive.wait(PATIENCE_S) == 0
 
 
+@pytest.mark.slow
 def test_syncs_count_where_time_is_theirs(start: Start, tmp_path: Path, channel: Path) -> None:
     fault = 'kind = "bus_off"\nat_sync = 2\nduration_syncs = 1'
     drive = start(COMMAND, "drive", drive_file(tmp_path, channel, fault))

@@ -37,6 +37,7 @@ def response(
     return position
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=60)
 @given(
     delay=st.floats(0.0, 3.0),

@@ -188,6 +188,7 @@ def test_progress_is_told_now_and_then(make_rig: RigFactory) -> None:
     assert told == [100, 200, 300, 400]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "otherwise",
     [
@@ -421,6 +422,7 @@ def test_drive_that_falls_silent(make_rig: RigFactory) -> None:
     assert loop.rig.node.read(0x6041) & 0x6F in (0x40, 0x07)
 
 
+@pytest.mark.slow
 def test_speed_and_position_limits_end_the_run(make_rig: RigFactory) -> None:
     for limit, value, text in (
         ("limits.speed_rad_s", 0.5, "rad/s beyond limits.speed_rad_s"),
@@ -579,6 +581,7 @@ def answering_late(loop: Loop, late: Callable[[int], bool]) -> None:
     loop.rig.tampering.process = slow  # type: ignore[method-assign]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ahead", [1, 1000])
 def test_late_rpdos_end_the_run(make_rig: RigFactory, ahead: int) -> None:
     loop = Loop(make_rig(pressing({"limits.late_cycles": 30})), real_time=True)
@@ -599,6 +602,7 @@ def test_late_rpdos_end_the_run(make_rig: RigFactory, ahead: int) -> None:
     assert_ended_in_order(loop, outcome, rows)
 
 
+@pytest.mark.slow
 def test_late_rpdos_that_are_only_counted(make_rig: RigFactory) -> None:
     loop = Loop(make_rig(pressing({"limits.late_cycles": 0})), real_time=True)
     answering_late(loop, lambda j: PRESSING <= j < PRESSING + 60)
@@ -607,6 +611,7 @@ def test_late_rpdos_that_are_only_counted(make_rig: RigFactory) -> None:
     assert loop.axis.late_rpdo >= 60
 
 
+@pytest.mark.slow
 def test_late_rpdos_with_one_in_time_among_them(make_rig: RigFactory) -> None:
     loop = Loop(make_rig(pressing({"limits.late_cycles": 30})), real_time=True)
     prompt = False

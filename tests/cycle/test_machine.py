@@ -98,6 +98,7 @@ def of_process(program: str) -> Any:
     return json.loads(done.stdout)
 
 
+@pytest.mark.slow
 def test_user_without_privileges() -> None:
     granted = of_process(
         """
@@ -131,6 +132,7 @@ def test_user_who_may_have_less_of_a_priority(monkeypatch: pytest.MonkeyPatch) -
     assert taken == [20, os.sched_getparam(0).sched_priority]
 
 
+@pytest.mark.slow
 def test_priority_is_given_back_without_privileges() -> None:
     """Only root takes back that children start without the priority."""
     with real_time_priority() as granted:

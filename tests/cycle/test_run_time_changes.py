@@ -154,6 +154,7 @@ def test_divided_law_plans_for_its_own_period() -> None:
     assert wall.cycle["rendered"]["wall"]["period"][0, 0] == pytest.approx(0.001)
 
 
+@pytest.mark.slow
 def test_divided_wall_is_worse_than_the_full_one(make_rig: RigFactory) -> None:
     """The chapter's experiment: the law at a fraction of the rate, data at the full one."""
     reach = {}

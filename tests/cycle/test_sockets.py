@@ -26,6 +26,7 @@ def pressing() -> Settings:
     return settings_with({"wall.law": "half_sample"})
 
 
+@pytest.mark.slow
 def test_many_cycles_at_a_time_are_the_same_cycles(make_rig: RigFactory) -> None:
     # Its schedule changes the law, its strikes have the wall come and go.
     one, many = Loop(make_rig(settings_with())), Loop(make_rig(settings_with()))
@@ -42,6 +43,7 @@ def test_many_cycles_at_a_time_are_the_same_cycles(make_rig: RigFactory) -> None
     assert many.record["j"][0] == len(many.rig.rpdos())
 
 
+@pytest.mark.slow
 def test_trip_ends_many_cycles_at_once(make_rig: RigFactory) -> None:
     one, many = (Loop(make_rig(settings_with({"limits.speed_rad_s": 0.5}))) for _ in range(2))
     many.exchange.ahead = 1000

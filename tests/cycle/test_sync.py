@@ -54,6 +54,7 @@ def with_external_sync(rig: Rig) -> Loop:
     return loop
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(60)
 def test_wall_on_the_sync_of_another_producer(make_rig: RigFactory) -> None:
     settings = settings_with({"wall.law": "half_sample", "bus.sync": "external"})

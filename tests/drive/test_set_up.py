@@ -205,6 +205,7 @@ def test_drive_that_falls_silent(rig: Rig) -> None:
         rig.node.read(0x6041)
 
 
+@pytest.mark.slow
 def test_mode_that_does_not_come(rig: Rig) -> None:
     rig.tampering.lies[(0x6061, 0)] = 8
     assert "0x6061 shows mode 8 after mode 10 was set" in error_of(rig)

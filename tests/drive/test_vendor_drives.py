@@ -166,6 +166,7 @@ def test_profile_torque(name: str, make_rig: RigFactory) -> None:
     assert abs(torques[0]).max() > 0.5
 
 
+@pytest.mark.slow
 def test_file_that_is_not_there_says_how_to_give_it() -> None:
     done = command("run", DRIVES / "epos4.toml")
     assert done.returncode == 2

@@ -106,6 +106,7 @@ def motions(draw: st.DrawFn) -> tuple[Handle, HandBody, Grasp, Force, Force]:
     return handle, hand, now, motor, Force(number(-2.0, 2.0), number(-2.0, 2.0), 0.0, 0.0)
 
 
+@pytest.mark.slow
 @settings(derandomize=True, deadline=None, max_examples=200)
 @given(motions())
 def test_any_motion_is_that_of_the_event_search(

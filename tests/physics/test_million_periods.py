@@ -105,6 +105,7 @@ def quadrature(
     return work, energy, way
 
 
+@pytest.mark.slow
 def test_a_motor_with_a_lag_pays_for_all_that_friction_takes() -> None:
     plant = make_plant(
         1.64e-4, spring=3.2, coulomb=0.01, cogging=0.003, cog_pitch=2.0 * math.pi / 24.0

@@ -36,6 +36,7 @@ def figure(copied: RunFolder, monkeypatch: pytest.MonkeyPatch) -> Figure:
     return figure
 
 
+@pytest.mark.slow
 def test_picture_of_the_run(four_strikes: Record) -> None:
     picture = matplotlib.image.imread(four_strikes.folder / "run.png")
     height, width, _ = picture.shape
@@ -47,6 +48,7 @@ def test_picture_of_the_run(four_strikes: Record) -> None:
     assert len(np.unique((picture[inked][:, :3] * 8).round(), axis=0)) > 10
 
 
+@pytest.mark.slow
 def test_command_draws_it_again(four_strikes: Record, copied: RunFolder) -> None:
     done = command("plot", copied.path)
     assert (done.returncode, done.stderr) == (0, "")
@@ -57,6 +59,7 @@ def test_command_draws_it_again(four_strikes: Record, copied: RunFolder) -> None
     assert np.array_equal(again, first)
 
 
+@pytest.mark.slow
 def test_folder_without_a_record(tmp_path: Path) -> None:
     done = command("plot", tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
@@ -108,6 +111,7 @@ def test_signals_are_drawn_as_recorded(figure: Figure, four_strikes: Record) -> 
     assert np.allclose(held[3:], np.maximum(penetration[2:-1], 0.0), atol=0.2)
 
 
+@pytest.mark.slow
 def test_run_without_contact(tmp_path: Path) -> None:
     done = command("run", "--duration", 0.1, "--output", tmp_path / "run")
     assert done.returncode == 0

@@ -166,6 +166,7 @@ def test_full_ring_counts_what_it_loses() -> None:
 # Writer
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bus_log", ["bus.log", "bus.asc", "bus.blf"])
 def test_round_trip_through_the_writer(tmp_path: Path, bus_log: str) -> None:
     rows, frames = some_rows(20_000), some_frames(500)  # more than one row group
@@ -191,6 +192,7 @@ def test_round_trip_through_the_writer(tmp_path: Path, bus_log: str) -> None:
         assert since == pytest.approx(frame.timestamp - frames[0].timestamp, abs=0.002)
 
 
+@pytest.mark.slow
 def test_empty_record(tmp_path: Path) -> None:
     with recording(tmp_path) as recorder:
         assert recorder.close() == []
@@ -200,6 +202,7 @@ def test_empty_record(tmp_path: Path) -> None:
     assert (tmp_path / "bus.log").read_text() == ""
 
 
+@pytest.mark.slow
 def test_what_was_lost_is_reported(tmp_path: Path) -> None:
     with recording(tmp_path) as recorder:
         recorder.ring.header["rows_lost"] = 7
@@ -210,6 +213,7 @@ def test_what_was_lost_is_reported(tmp_path: Path) -> None:
         ]
 
 
+@pytest.mark.slow
 def test_folder_that_cannot_be_written(tmp_path: Path) -> None:
     with recording(tmp_path / "nowhere") as recorder:
         put_rows(recorder.ring, some_rows(10))
@@ -265,6 +269,7 @@ def master(folder: Path, what: str) -> "subprocess.Popen[str]":
     )
 
 
+@pytest.mark.slow
 def test_killed_master_leaves_a_complete_record(tmp_path: Path) -> None:
     with master(tmp_path, "kill") as process:
         assert process.stdout is not None
@@ -278,6 +283,7 @@ def test_killed_master_leaves_a_complete_record(tmp_path: Path) -> None:
         assert len(list(reader)) == len(some_frames(3000))
 
 
+@pytest.mark.slow
 def test_ctrl_c_does_not_end_the_writer(tmp_path: Path) -> None:
     with master(tmp_path, "ctrl-c") as process:
         assert process.wait(PATIENCE_S) == 0
@@ -350,6 +356,7 @@ def wait_until_on_disk(folder: Path, rows: int) -> None:
         time.sleep(0.02)
 
 
+@pytest.mark.slow
 def test_record_is_readable_without_its_end(tmp_path: Path) -> None:
     """Loss of power: neither master nor writer gets to say a last word."""
     rows, frames = some_rows(3000), some_frames(100)
@@ -365,6 +372,7 @@ def test_record_is_readable_without_its_end(tmp_path: Path) -> None:
     assert len(lines) == len(frames)
 
 
+@pytest.mark.slow
 def test_stream_that_was_cut_anywhere_is_readable_up_to_there(tmp_path: Path) -> None:
     rows = some_rows(1500)
     with recording(tmp_path, bus_log="") as recorder:
@@ -384,6 +392,7 @@ def test_stream_that_was_cut_anywhere_is_readable_up_to_there(tmp_path: Path) ->
     assert max(found) == 1500
 
 
+@pytest.mark.slow
 def test_disk_that_is_full_is_told_and_stops_nothing(tmp_path: Path) -> None:
     rows = some_rows(ROWS // 2)
     with recording(tmp_path) as recorder:

@@ -93,6 +93,7 @@ def test_change_is_in_force_from_the_cycle_that_it_is_told(
     assert loop.record["torque_limit"][0] == 1.5
 
 
+@pytest.mark.slow
 def test_run_of_the_command_is_changed_by_the_command(start: Start, tmp_path: Path) -> None:
     file = config_file(
         tmp_path / "c.toml",

@@ -50,6 +50,7 @@ def assert_same(bus: NDArray[np.void], memory: NDArray[np.void]) -> None:
         assert not len(differs), f"{name} from cycle {differs[0] + 1} on"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS)
 def test_every_law_comes_to_the_same_bits(make_rig: RigFactory, law: str) -> None:
     name, deadbeat = law.removesuffix(DEADBEAT), law.endswith(DEADBEAT)
@@ -84,6 +85,7 @@ VARIANTS: list[dict[str, Any]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("overrides", VARIANTS, ids=lambda overrides: ", ".join(overrides))
 def test_every_setting_comes_to_the_same_bits(
     make_rig: RigFactory, overrides: dict[str, Any]
@@ -94,6 +96,7 @@ def test_every_setting_comes_to_the_same_bits(
     assert_same(through_the_bus(make_rig, settings, 2000), memory.rows)
 
 
+@pytest.mark.slow
 def test_hand_that_loses_the_handle_comes_to_the_same_bits(make_rig: RigFactory) -> None:
     settings = strikes({"wall.law": "half_sample", "limits.speed_rad_s": 1000.0})
     assert settings.simulation is not None

@@ -165,6 +165,7 @@ def assert_whole(record: Record, said: list[str]) -> None:
     assert (record.folder / "trip.csv").exists() == (record.summary["trip_cycle"] is not None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exchange", ["python-can", "native"])
 @pytest.mark.parametrize("case", cases(), ids=lambda case: f"{case.fault}, {case.when}")
 def test_case(

@@ -166,6 +166,7 @@ def test_torque_recomputed_from_the_frames_alone(four_strikes: Record) -> None:
 # The same run again
 
 
+@pytest.mark.slow
 def test_same_signals_with_the_processor_loaded(
     four_strikes: Record, start: Start, tmp_path: Path
 ) -> None:
@@ -179,6 +180,7 @@ def test_same_signals_with_the_processor_loaded(
     assert {n: again.summary[n] for n in clock} == {n: four_strikes.summary[n] for n in clock}
 
 
+@pytest.mark.slow
 def test_other_settings_give_other_signals(four_strikes: Record, tmp_path: Path) -> None:
     done = command(
         "run",
@@ -223,6 +225,7 @@ def start_drive(start: Start, configuration: Path) -> "subprocess.Popen[str]":
     return drive
 
 
+@pytest.mark.slow
 def test_drive_in_a_process_of_its_own_with_a_logger_beside(
     four_strikes: Record, start: Start, unixcan: Path, channel: Path, tmp_path: Path
 ) -> None:
@@ -270,6 +273,7 @@ def assert_logger_has_the_same(
         assert len(seen) - len(recorded) <= (can_id in (0x285, 0x385)), hex(can_id)
 
 
+@pytest.mark.slow
 def test_master_may_start_first(
     four_strikes: Record, start: Start, unixcan: Path, channel: Path, tmp_path: Path
 ) -> None:
@@ -283,6 +287,7 @@ def test_master_may_start_first(
     assert drive.wait(PATIENCE_S) == 0
 
 
+@pytest.mark.slow
 def test_drive_that_does_not_come(unixcan: Path, tmp_path: Path) -> None:
     unixcan.write_text(unixcan.read_text().replace("wait_s = 5.0", "wait_s = 0.0"))
     done = command("run", unixcan, "--output", tmp_path / "run")
@@ -318,6 +323,7 @@ def assert_left_in_order(record: Record) -> None:
     assert (record.folder / "run.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_ctrl_c_in_the_middle(start: Start, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     running = start(COMMAND, "run", "--duration", 3600, "--output", folder)
@@ -328,6 +334,7 @@ def test_ctrl_c_in_the_middle(start: Start, tmp_path: Path) -> None:
     assert_left_in_order(Record(folder))
 
 
+@pytest.mark.slow
 def test_others_may_ask_the_drive_while_it_runs_in_real_time(
     start: Start, unixcan: Path, channel: Path, tmp_path: Path
 ) -> None:
@@ -360,6 +367,7 @@ def test_others_may_ask_the_drive_while_it_runs_in_real_time(
 # Runs that fail
 
 
+@pytest.mark.slow
 def test_trip_is_the_outcome(tmp_path: Path) -> None:
     file = config_file(tmp_path / "c.toml", {"speed_rad_s = 60.0": "speed_rad_s = 0.5"})
     done = command("run", file, "--output", tmp_path / "run")
@@ -371,6 +379,7 @@ def test_trip_is_the_outcome(tmp_path: Path) -> None:
     assert struct.unpack("<Hh", record.cycles[-1][1]) == (0x00, 0)
 
 
+@pytest.mark.slow
 def test_start_inside_the_wall(tmp_path: Path) -> None:
     file = config_file(tmp_path / "c.toml", {"position_rad = 0.0\n": "position_rad = 0.2\n"})
     done = command("run", file, "--output", tmp_path / "run")
@@ -380,6 +389,7 @@ def test_start_inside_the_wall(tmp_path: Path) -> None:
     assert max(abs(a - b) for a, b in itertools.pairwise(torques[:100])) < 100
 
 
+@pytest.mark.slow
 def test_bus_that_fails_before_the_first_cycle(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

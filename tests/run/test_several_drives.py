@@ -32,6 +32,7 @@ def run_all(many: list[Settings], output: Path) -> list[RunResult]:
         return run_together(many, recorders, output)
 
 
+@pytest.mark.slow
 def test_each_is_as_if_it_were_alone(tmp_path: Path) -> None:
     many = [
         settings_of(5, {"wall.law": "half_sample"}),
@@ -56,6 +57,7 @@ def test_each_is_as_if_it_were_alone(tmp_path: Path) -> None:
         assert log.count(rpdo) == together[0].outcome.cycles
 
 
+@pytest.mark.slow
 def test_trip_of_one_takes_the_torque_from_all(tmp_path: Path) -> None:
     many = [
         settings_of(5, {"wall.law": "half_sample"}),

@@ -134,6 +134,7 @@ def walled(
 # The master is asked to end
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "exchange"),
     [
@@ -162,6 +163,7 @@ def test_signal_that_asks_for_the_end(
     assert Record(folder).summary["interrupted"] is True
 
 
+@pytest.mark.slow
 def test_terminal_that_is_closed_under_nohup(start: Start, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     log = folder / "bus.log"
@@ -202,6 +204,7 @@ def test_impatient_ctrl_c_while_the_drive_is_taken_down(make_rig: RigFactory) ->
 # The master is dead
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("watchdog", "exchange"),
     [*((watchdog, "native") for watchdog in WATCHDOGS), ("consumer heartbeat", "python-can")],
@@ -234,6 +237,7 @@ def complete(folder: Path) -> bool:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("watchdog", WATCHDOGS)
 def test_master_that_stands_still_for_longer_than_the_watchdog(
     start: Start, tmp_path: Path, watchdog: str
@@ -264,6 +268,7 @@ def test_master_that_stands_still_for_longer_than_the_watchdog(
 # The record's writer is dead
 
 
+@pytest.mark.slow
 def test_writer_that_is_killed_takes_nothing_with_it(start: Start, tmp_path: Path) -> None:
     with walled(start, tmp_path) as (master, witness, _):
         (writer,) = Path(f"/proc/{master.pid}/task/{master.pid}/children").read_text().split()
@@ -282,6 +287,7 @@ def test_writer_that_is_killed_takes_nothing_with_it(start: Start, tmp_path: Pat
 # The law fails
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "body",
     ["return math.nan", "return wall.memory[int(1e6 * wall.y_sample)]", 'raise ValueError("no")'],

@@ -241,6 +241,7 @@ class Fuzzed(Bench):
         ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", DICTIONARIES)
 @settings(max_examples=100, derandomize=True, deadline=None)
 @given(events=event_lists)
@@ -261,6 +262,7 @@ def without_enabling(event: Event) -> Event:
     return can_id, bytes(byte & 0xF7 if byte & 0x0F == 0x0F else byte for byte in data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", DICTIONARIES)
 @settings(max_examples=50, derandomize=True, deadline=None)
 @given(events=event_lists)
@@ -272,6 +274,7 @@ def test_nobody_enables_it_nothing_moves(file: str, events: list[Event]) -> None
     assert not any(call[1] for call in bench.motion.calls if call[0] == "advance")
 
 
+@pytest.mark.slow
 def test_sequences_do_what_they_are_to_do() -> None:
     """As they stand, they lead into the depths: only then is it worth while to disturb them."""
     refused: list[bytes] = []
@@ -288,6 +291,7 @@ def test_sequences_do_what_they_are_to_do() -> None:
     assert refused == []
 
 
+@pytest.mark.slow
 @settings(max_examples=60, derandomize=True, deadline=None)
 @given(frames=st.lists(any_data, max_size=60))
 def test_drive_sends_under_its_own_identifiers_only(frames: list[Data]) -> None:
@@ -321,6 +325,7 @@ def data_message(frame: Data) -> can.Message:
     return can.Message(arbitration_id=frame[0], data=frame[1], is_extended_id=False)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, derandomize=True, deadline=None)
 @given(
     messages=st.lists(

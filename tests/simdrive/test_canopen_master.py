@@ -100,6 +100,7 @@ def test_heartbeat_and_reset(node: BaseNode402) -> None:
     assert node.sdo["Producer heartbeat time"].raw == 0
 
 
+@pytest.mark.slow
 def test_lss(node: BaseNode402) -> None:
     lss = node.network.lss
     lss.RESPONSE_TIMEOUT = WAIT_S
@@ -120,6 +121,7 @@ def test_lss(node: BaseNode402) -> None:
     assert other.sdo[0x1200][1].raw == 0x609
 
 
+@pytest.mark.slow
 def test_lss_finds_who_has_no_node_id(node: BaseNode402) -> None:
     """canopen takes no answer to a scanned bit for a 1, so its patience is how long a 1 takes."""
     lss = node.network.lss
@@ -141,6 +143,7 @@ def test_lss_finds_who_has_no_node_id(node: BaseNode402) -> None:
     assert node.sdo[0x1200][1].raw == 0x605
 
 
+@pytest.mark.slow
 def test_lss_identifies(node: BaseNode402) -> None:
     lss = node.network.lss
     lss.send_identify_remote_slave(0, 1, 0, 0xFFFFFFFF, 0, 0xFFFFFFFF)

@@ -117,6 +117,7 @@ def choose(node: BaseNode402, mode: int) -> None:
     assert node.sdo[0x6061].raw == mode
 
 
+@pytest.mark.slow
 def test_life_of_a_drive(served: Served) -> None:
     node = served.node
     described = node.object_dictionary

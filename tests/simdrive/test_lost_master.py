@@ -190,6 +190,7 @@ def test_what_is_offered() -> None:
     assert len(cases()) == 4 * 4 * 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", DICTIONARIES)
 def test_dead_master(file: str) -> None:
     # Time goes on without SYNCs.

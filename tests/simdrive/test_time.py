@@ -105,6 +105,7 @@ class MassBench(Bench):
 torques = st.lists(st.integers(-1000, 1000), min_size=1, max_size=12)
 
 
+@pytest.mark.slow
 @settings(derandomize=True, deadline=None, max_examples=60)
 @given(
     torques=torques,
@@ -170,6 +171,7 @@ def test_torque_written_over_sdo_acts_on_reception() -> None:
     assert bench.motion.speed == pytest.approx(300 * NM_PER_MILLE * PERIOD_S / INERTIA)
 
 
+@pytest.mark.slow
 @settings(derandomize=True, deadline=None, max_examples=60)
 @given(
     events=st.lists(

@@ -25,6 +25,9 @@ BEGINS, STRUCK = "Enter begins, q ends: ", "y, n, again: "
 ONE, TWO, FOR_EVER = 1.0, 2.0, 1e6
 
 
+pytestmark = pytest.mark.slow
+
+
 class Person:
     """A study in a process of its own: reads its prompts and answers them."""
 

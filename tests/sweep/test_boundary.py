@@ -53,6 +53,7 @@ def swings(dataset: xr.Dataset) -> Any:
     return (share > 0.01).any(("speed", "phase")).values.squeeze()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0, 1, 2])
 @pytest.mark.parametrize("share", [0.01, 0.02, 0.05])
 def test_linear_stability_with_delay(delay: int, share: float) -> None:

@@ -8,6 +8,7 @@ from canwall.sweep import make_plan
 from canwall.sweep.plan import compute_piece
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("operator", ["none", "finger"])
 @pytest.mark.parametrize("law", ["mean_force", "half_sample"])
 def test_handle_that_friction_stops_is_no_stuck_encoder(law: str, operator: str) -> None:

@@ -30,6 +30,7 @@ def raw(plan: Plan) -> list[bytes]:
     return [compute_piece(plan, piece).tobytes() for piece in range(plan.pieces)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "axes",
     [
@@ -49,6 +50,7 @@ def test_through_the_bus_and_in_memory_it_is_the_same(axes: dict[str, Any]) -> N
     assert raw(plan_of("bus", **axes)) == raw(plan_of(**axes))
 
 
+@pytest.mark.slow
 def test_a_map_has_every_axis_with_its_unit(tmp_path: Path) -> None:
     plan = plan_of(
         stiffness="1:100:5",
@@ -84,6 +86,7 @@ def test_a_map_has_every_axis_with_its_unit(tmp_path: Path) -> None:
     assert there["peak_torque"].item() == pytest.approx(measured["peak_torque"], rel=1e-9)
 
 
+@pytest.mark.slow
 def test_the_result_does_not_depend_on_the_workers(tmp_path: Path) -> None:
     plan = plan_of(law=["standard", "half_sample"], operator=["none", "finger"])
     one = sweep(plan, tmp_path / "one.nc", workers=1)
@@ -124,6 +127,7 @@ def stop_after(count: int) -> Any:
     return progress
 
 
+@pytest.mark.slow
 def test_an_interrupted_sweep_goes_on(tmp_path: Path) -> None:
     plan = plan_of(stiffness="1:100:40", operator=["none", "finger", "grip", "hand"])
     whole = sweep(plan, tmp_path / "whole.nc")
@@ -131,7 +135,7 @@ def test_an_interrupted_sweep_goes_on(tmp_path: Path) -> None:
     with pytest.raises(StoppedError):
         sweep(plan, output, workers=1, progress=stop_after(2))
     assert not output.exists()
-    with pytest.raises(InputError, match="holds an unfinished sweep; --resume goes on"):
+    with pytest.raises(InputError, match="holds an unfinished sweep; --resume continues"):
         sweep(plan, output)
     other = plan_of(stiffness="1:100:41", operator=["none", "finger", "grip", "hand"])
     with pytest.raises(InputError, match="another configuration or other axes"):
@@ -198,6 +202,7 @@ def test_a_wrong_axis(axes: dict[str, str], message: str) -> None:
         plan_of(**axes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
@@ -228,6 +233,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_somebody_else_at_the_address_is_no_scheduler(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
@@ -247,6 +253,7 @@ def settings_file() -> Path:
     return SIM_CONFIG
 
 
+@pytest.mark.slow
 def test_the_axes_of_the_file_and_those_of_the_command_line(tmp_path: Path) -> None:
     text = settings_file().read_text().replace("../eds", str(settings_file().parents[1] / "eds"))
     file = tmp_path / "axes.toml"
@@ -266,6 +273,7 @@ def test_the_axes_of_the_file_and_those_of_the_command_line(tmp_path: Path) -> N
     assert again.stderr == "canwall: a.nc: exists already; choose another --output\n"
 
 
+@pytest.mark.slow
 def test_k_limits_are_shown_in_a_table(tmp_path: Path) -> None:
     done = command(
         *(

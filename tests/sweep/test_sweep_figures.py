@@ -49,6 +49,7 @@ def line(figure: Figure, panel: int, label: str) -> np.ndarray[Any, np.dtype[np.
     return np.asarray(found.get_xydata())
 
 
+@pytest.mark.slow
 def test_every_picture_of_a_map_is_written(z_width: Path) -> None:
     done = command("plot", z_width)
     assert (done.returncode, done.stderr) == (0, "")
@@ -61,6 +62,7 @@ def test_every_picture_of_a_map_is_written(z_width: Path) -> None:
         assert height > 400
 
 
+@pytest.mark.slow
 def test_a_map_has_a_panel_for_each_condition_and_the_limits_in_it(
     z_width: Path, drawn: dict[str, Figure]
 ) -> None:
@@ -91,6 +93,7 @@ def test_a_map_has_a_panel_for_each_condition_and_the_limits_in_it(
         assert not shown.all()
 
 
+@pytest.mark.slow
 def test_energy_is_that_of_the_worst_strike(z_width: Path, drawn: dict[str, Figure]) -> None:
     dataset = read_sweep(z_width)
     write_sweep_figures(dataset, z_width.with_suffix(""))
@@ -119,6 +122,7 @@ def test_k_limits_over_the_rate(tmp_path: Path, drawn: dict[str, Figure]) -> Non
         assert limit == pytest.approx(exact / 1.64e-4 / rate**2, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_limits_of_one_condition_and_what_cannot_be_drawn(tmp_path: Path) -> None:
     limits = swept(tmp_path / "limits.nc", law=["standard", "midpoint"])
     (path,) = write_sweep_figures(limits, tmp_path / "limits")
@@ -130,6 +134,7 @@ def test_limits_of_one_condition_and_what_cannot_be_drawn(tmp_path: Path) -> Non
         write_sweep_figures(point, tmp_path / "point")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("content", "line"),
     [

@@ -66,6 +66,7 @@ def test_example_without_growth_is_the_clamped_midpoint(example: str) -> None:
         assert mine[:100] == pytest.approx(theirs[:100], rel=1e-9, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_ball_command_finds_the_file_from_where_it_is_called(example: str, tmp_path: Path) -> None:
     for _start in ("compiled", "as compiled by the first"):
         done = command(
@@ -80,6 +81,7 @@ def test_ball_command_finds_the_file_from_where_it_is_called(example: str, tmp_p
     assert force.max() > 1.0
 
 
+@pytest.mark.slow
 def test_run_finds_the_file_beside_its_configuration(example: str, tmp_path: Path) -> None:
     (tmp_path / "sim.toml").write_text(SIM_CONFIG.read_text().partition("[[schedule]]")[0])
     config = config_file(
@@ -216,6 +218,7 @@ def test_own_law_has_no_deadbeat(write: Write) -> None:
         find_law(write("def mine(wall):\n    return 0.0\n"), deadbeat=True)
 
 
+@pytest.mark.slow
 def test_run_says_it_in_one_line(write: Write, tmp_path: Path) -> None:
     law = write("def mine(wall):\n    pass\n")
     done = command("run", "--law", law, "--output", tmp_path / "run")

@@ -133,6 +133,7 @@ def test_damper_is_on_the_backward_difference() -> None:
 # The referent
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "ball",
     [

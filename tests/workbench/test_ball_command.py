@@ -137,6 +137,7 @@ def test_no_periods(bounce: Bounce) -> None:
     assert bounce.file.read_text() == "t,y,v,f\n0,2,0,0\n"
 
 
+@pytest.mark.slow
 def test_installed_command(tmp_path: Path) -> None:
     done = command("ball", "--law", "midpoint", "--output", "ball.csv", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")

@@ -72,6 +72,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
     return Written(folder, path.read_text(encoding="utf-8"), steps)
 
 
+@pytest.mark.slow
 def test_every_figure_has_its_files_and_nothing_else_is_left(written: Written) -> None:
     expected = {f"{name}.{kind}" for name in NAMES for kind in ("png", "csv")} | {"index.md"}
     assert {path.name for path in written.folder.iterdir()} == expected
@@ -236,6 +237,7 @@ def test_displayed_effort_of_figure_5_19_belongs_to_the_sample_before(written: W
     np.testing.assert_allclose(shown[1:], np.minimum(y[:-1], 0.0), rtol=0, atol=half_step + 1e-9)
 
 
+@pytest.mark.slow
 def test_effort_not_displayed_is_the_laws_own() -> None:
     recorded = record_run()
     settings = recorded.settings
