@@ -28,13 +28,21 @@ def make_drive(
     bitrate: int = DEFAULT_BITRATE,
     report: Callable[[str], None] = lambda line: None,
 ) -> FaultyDrive:
-    """The drive that the configuration describes, not yet switched on.
+    """Make the drive that the configuration describes, not yet switched on.
 
     Rated torque and encoder are those of its dictionary (0x6076, 0x608F, 0x6091), and those of
     the simulation where the dictionary has none, or an encoder of 1/1. A node-ID that LSS has
-    stored goes first.
-    `bitrate` [bit/s] is that of the bus; report is told in a line when a fault begins or ends.
-    Raises DictionaryError.
+    stored takes precedence.
+
+    Args:
+        drive: `[drive]`, for dictionary and node-ID.
+        simulation: `[simulation]`.
+        sync_period_s: time from one SYNC to the next.
+        bitrate: of the bus, in bit/s.
+        report: called with a line when a fault begins or ends.
+
+    Raises:
+        DictionaryError: the dictionary cannot be read, or no drive can be built from it.
     """
     memory = Memory(simulation.store)
     node_id = memory.node_id or drive.node_id
@@ -60,11 +68,13 @@ def make_drive(
 
 
 class ServoScales(NamedTuple):
-    """What a drive's numbers mean.
+    """Scales of a drive's numbers.
 
-    counts_per_rev: encoder increments per turn of the shaft. rated_torque_mnm: at the motor.
-    gear_ratio: turns of the motor per turn of the shaft. torque_limit_per_mille: what the drive
-    shows as its limit.
+    Attributes:
+        counts_per_rev: encoder increments per turn of the shaft.
+        gear_ratio: turns of the motor per turn of the shaft.
+        rated_torque_mnm: at the motor.
+        torque_limit_per_mille: the lowest limit in the dictionary.
     """
 
     counts_per_rev: float
@@ -74,7 +84,11 @@ class ServoScales(NamedTuple):
 
 
 def servo_scales(drive: DriveSettings, simulation: Simulation) -> ServoScales:
-    """Scales of the drive that `make_drive` makes. Raises DictionaryError."""
+    """Return the scales of the drive that `make_drive` makes.
+
+    Raises:
+        DictionaryError: as `make_drive`.
+    """
     dictionary = _dictionary(drive, simulation, drive.node_id)
     counts, gear_ratio = _encoder(dictionary, simulation)
     limits = [
@@ -87,7 +101,7 @@ def servo_scales(drive: DriveSettings, simulation: Simulation) -> ServoScales:
 
 
 def _dictionary(drive: DriveSettings, simulation: Simulation, node_id: int) -> Dictionary:
-    """The drive's dictionary, with what the simulation knows where it is silent."""
+    """Read the drive's dictionary, completed from the simulation."""
     dictionary = Dictionary.load(drive.eds, node_id)
     for (index, subindex), value in simulation.objects_by_index.items():
         dictionary.power_on_with(index, subindex, value)
@@ -100,9 +114,9 @@ def _dictionary(drive: DriveSettings, simulation: Simulation, node_id: int) -> D
 
 
 def _encoder(dictionary: Dictionary, simulation: Simulation) -> tuple[float, float]:
-    """Increments per turn of the shaft, and turns of the motor per turn of the shaft."""
+    """Return increments per turn of the shaft, and turns of the motor per turn of the shaft."""
     gear_ratio = quotient(dictionary, 0x6091)
-    # What the encoder has, whatever unit the drive shows. 1/1 says as little as nothing.
+    # Increments of the encoder, whatever unit the drive shows; 1/1 is no resolution.
     resolution = quotient(dictionary, 0x608F)
     return (simulation.counts_per_rev if resolution == 1.0 else resolution) * gear_ratio, gear_ratio
 

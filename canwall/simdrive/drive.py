@@ -1,4 +1,4 @@
-"""The simulated drive: which service takes which frame in which NMT state, and what SYNC does."""
+"""The simulated drive: frames to services by NMT state, and the effect of SYNC."""
 
 from collections.abc import Callable
 from functools import partial
@@ -49,8 +49,11 @@ class SimulatedDrive:
     No threads and no clock: SYNC moves the physics by one period, ``tick`` the protocol timers.
     In real time ``tick`` moves the physics too, and SYNC does not.
 
-    The physics are lazy. What holds between two instants is known at the second: only then is the
-    motion moved on, under the torque that held, before anything is sampled or changed.
+    The physics are lazy: the motion is moved on, under the torque that held until now, only when
+    something is about to be sampled or changed.
+
+    In steady operation, one compiled call handles a SYNC or RPDO (`steady`); at all other times
+    the services do, on the same record (`state`).
     """
 
     def __init__(
@@ -72,15 +75,15 @@ class SimulatedDrive:
             node_id: 1 to 127, or UNCONFIGURED: then LSS alone has to give it one.
             motion: motor, encoder and hand.
             sync_period_s: time in seconds from one SYNC to the next.
-            memory: what keeps stored parameters (0x1010) and the node-ID of LSS.
+            memory: keeps stored parameters (0x1010) and the node-ID of LSS.
             bitrate: of the bus, in bit/s.
             torque_delay_cycles: from the torque that a PDO brings to its effect, in SYNC periods,
                 beyond what the transmission type of the PDO makes of it.
-            real_time: the physics move by the time that ``tick`` tells.
-            hardware: what the dictionary does not say of the drive; None: the usual.
+            real_time: the physics move with ``tick``.
+            hardware: properties of the drive that its dictionary does not have; None: defaults.
 
         Raises:
-            DictionaryError: the dictionary has what no drive can be built from.
+            DictionaryError: no drive can be built from the dictionary.
             ValueError: the node-ID is not that of the dictionary, the period not positive, or the
                 delay negative.
         """
@@ -103,7 +106,7 @@ class SimulatedDrive:
         self._memory = memory or Memory(None)
         self._bitrate = bitrate
         self.real_time = real_time
-        """True if the physics move by the time that ``tick`` tells, not by the count of SYNCs."""
+        """True if the physics move with ``tick``, not with the count of SYNCs."""
         self._passes_syncs = True
         self._hardware = hardware or Hardware()
         self._extensions: list[Callable[[Dictionary], None]] = []
@@ -164,7 +167,7 @@ class SimulatedDrive:
 
     @property
     def passes_syncs(self) -> bool:
-        """True if a SYNC that arrives is one on the bus; False: ``pass_sync`` tells of those."""
+        """True if time passes with each SYNC that arrives; False: with ``pass_sync`` alone."""
         return self._passes_syncs
 
     @passes_syncs.setter
@@ -179,7 +182,7 @@ class SimulatedDrive:
 
     @property
     def actuator(self) -> Actuator:
-        """The way of the torque to the motion."""
+        """What the demanded torque passes on its way to the motion."""
         return self._actuator
 
     @property
@@ -198,7 +201,7 @@ class SimulatedDrive:
         return self._sync.can_id
 
     def extend(self, serve: Callable[[Dictionary], None]) -> None:
-        """Let somebody else serve objects of the dictionary as well.
+        """Let another service have objects of the dictionary as well.
 
         Args:
             serve: called now, and again with every dictionary that takes the place of this one.
@@ -207,7 +210,7 @@ class SimulatedDrive:
         serve(self._dictionary)
 
     def switch_off(self) -> None:
-        """Take the supply away: the drive is dead until ``boot``."""
+        """Switch the device off; it is dead until ``boot``."""
         self._pds.disable()
         self._nmt.state = NmtState.INITIALISATION
         self._route()
@@ -219,7 +222,7 @@ class SimulatedDrive:
         self._error_behaviour.communication_error()
 
     def bus_recovered(self) -> None:
-        """Tell that the controller is back on the bus."""
+        """Report that the controller is back on the bus (EMCY 0x8140)."""
         self._emcy.occurred(RECOVERED_FROM_BUS_OFF, ERROR_BEHAVIOUR)
         self._emcy.gone(RECOVERED_FROM_BUS_OFF, ERROR_BEHAVIOUR)
 
@@ -229,7 +232,7 @@ class SimulatedDrive:
         return self.take_outbox()
 
     def process(self, can_id: int, data: bytes) -> list[Frame]:
-        """Take a frame from the bus and return the frames that it makes the drive send.
+        """Take a frame from the bus and return the frames that the drive sends in return.
 
         Args:
             can_id: 11-bit identifier.
@@ -276,7 +279,7 @@ class SimulatedDrive:
         return self.take_outbox()
 
     def take_outbox(self) -> list[Frame]:
-        """Return the frames that what was done to the drive makes it send."""
+        """Return the frames that the drive has to send after a change from outside."""
         self._settle()
         if not self._outbox:
             return []
@@ -285,7 +288,7 @@ class SimulatedDrive:
         return frames if self._clock.now_ns >= self._silent_until_ns else []
 
     def _settle(self) -> None:
-        """See whether what comes next is for compiled code (`steady`)."""
+        """Decide whether the next frame is for `steady`."""
         self._fields.steady = (
             self._pdos_are_steady
             and self._pds.steady
@@ -304,7 +307,7 @@ class SimulatedDrive:
         self._silent_until_ns = self._clock.now_ns + duration_ms * NS_PER_MS
 
     def _route(self) -> None:
-        """Settle who takes what: every change of NMT state or of a COB-ID ends here."""
+        """Assign services to CAN-IDs, after every change of NMT state or of a COB-ID."""
         state = self._nmt.state
         operational = state is NmtState.OPERATIONAL
         rpdos = [pdo for pdo in self._rpdos if operational and pdo.active]
@@ -318,8 +321,8 @@ class SimulatedDrive:
             routes |= _receivers([(pdo, self._receive_of(pdo)) for pdo in rpdos])
             routes |= self._heartbeat_consumer.routes()
             if state is not NmtState.STOPPED:
-                routes[self._sdo.can_id] = self._at_once(self._sdo.receive)
-            # The world does not stand still where NMT wants no SYNC.
+                routes[self._sdo.can_id] = self._with_immediate_torque(self._sdo.receive)
+            # The motion does not stand still in NMT states without SYNC.
             routes[self._sync.can_id] = self._on_sync
             routes[NMT] = self._nmt.receive
             routes[LSS_REQUEST] = self._lss.receive
@@ -332,7 +335,7 @@ class SimulatedDrive:
         self._settle_pdos()
 
     def _settle_pdos(self) -> None:
-        """Tell compiled code what SYNC moves, if these are PDOs for it."""
+        """Write to the record which PDOs SYNC moves, and see whether `steady` covers them."""
         fields, rpdos, tpdos = self._fields, self._sync_rpdos, self._sync_tpdos
         self._pdos_are_steady = (
             len(rpdos) == 1
@@ -348,10 +351,14 @@ class SimulatedDrive:
         self._sync_frames = [(pdo.can_id, pdo.payload) for pdo in tpdos]
 
     def _receive_of(self, received: Rpdo) -> Receive:
-        return received.receive if received.synchronous else self._at_once(received.receive)
+        return (
+            received.receive
+            if received.synchronous
+            else self._with_immediate_torque(received.receive)
+        )
 
-    def _at_once(self, receive: Receive) -> Receive:
-        """Let a torque that a frame brings hold from its arrival on, not from the next SYNC."""
+    def _with_immediate_torque(self, receive: Receive) -> Receive:
+        """Let a torque that a frame brings act from its arrival on, not from the next SYNC."""
 
         def received(data: bytes) -> None:
             receive(data)
@@ -368,7 +375,7 @@ class SimulatedDrive:
         self._fields.passed += periods * self._sync_period_s
 
     def pass_sync(self) -> None:
-        """Let the world go on to a SYNC on the bus, whether the drive hears it or not."""
+        """Let time pass until a SYNC on the bus, whether the drive receives it or not."""
         fields = self._fields
         fields.syncs += 1
         fields.without_sync = 0.0
@@ -388,10 +395,10 @@ class SimulatedDrive:
             self._pds.show_torque(self._actuator.torque_nm(self._pds.torque_nm))
 
     def _go_on_without_sync(self, dt: float) -> None:
-        """Let a drive come to rest whose SYNC, and so its master, has gone.
+        """Go on with a slow-down after the SYNC, and so the master, has gone.
 
-        A tick counts for a few milliseconds at the most: where the program itself was held up,
-        the SYNC may be waiting.
+        A tick counts for a few milliseconds at most: if the program itself was held up, the SYNC
+        may be waiting.
         """
         fields = self._fields
         fields.without_sync += min(dt, _LONGEST_TICK_S)
@@ -469,7 +476,7 @@ class SimulatedDrive:
 
 
 def _receivers(rpdos: list[tuple[Rpdo, Receive]]) -> dict[int, Receive]:
-    """Return who takes each CAN-ID; several RPDOs may listen to one."""
+    """Return the receiver of each CAN-ID; several RPDOs may listen to one."""
     listeners: dict[int, list[Receive]] = {}
     for pdo, receive in rpdos:
         listeners.setdefault(pdo.can_id, []).append(receive)

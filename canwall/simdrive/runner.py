@@ -14,15 +14,15 @@ _TICK_S = 0.001
 """Least time between ticks, and longest wait for a frame."""
 
 _DISTURBED = (errno.ENETDOWN, errno.ENOBUFS)
-"""What an interface answers that is down, or whose transmit queue is full."""
+"""Error codes of an interface that is down, or whose transmit queue is full."""
 
 
 class Device(Protocol):
-    """What lives on a bus: frames in, frames out, and time."""
+    """A device on a bus: frames in, frames out, and time."""
 
     @property
     def real_time(self) -> bool:
-        """Whether it is to know of the time at which each frame comes."""
+        """True if time has to be up to date whenever a frame comes."""
         ...
 
     def boot(self) -> list[Frame]:
@@ -43,9 +43,9 @@ class Device(Protocol):
 
 
 class BusRunner:
-    """Carries frames between a bus and a drive, in their order, and measures time for it.
+    """Carries frames between a bus and a drive, in their order, and measures its time.
 
-    Use ``poll`` within another program's loop, or ``run`` to have the thread to oneself.
+    Call ``poll`` from another program's loop, or let ``run`` have the thread.
     """
 
     def __init__(
@@ -60,11 +60,11 @@ class BusRunner:
 
         Args:
             drive: not yet switched on.
-            bus: where it lives; stays the caller's to shut down.
-            clock: tells the time in seconds.
-            error_frames: whether the bus takes error frames. A real controller makes its own, and
+            bus: the bus of the drive; the caller shuts it down.
+            clock: returns the time in seconds.
+            error_frames: True if the bus takes error frames. A real controller makes its own, and
                 sends as data what it is given.
-            report: is told when ``run`` finds the bus gone, and when it is back.
+            report: called with a line when ``run`` finds the bus gone, and when it is back.
 
         Raises:
             can.CanError: the bus does not take the message.
@@ -89,10 +89,10 @@ class BusRunner:
         self._tick(_TICK_S)
 
     def run(self, stop: Callable[[], bool]) -> None:
-        """Serve the bus until ``stop`` says so; it is asked every millisecond or more often.
+        """Serve the bus until ``stop``, asked every millisecond or more often, returns True.
 
-        A drive does not end with its bus: while the interface is down, or takes no frames, what
-        would have been sent is lost, and time passes for the drive.
+        A drive outlives its bus: while the interface is down, or takes no frames, what it sends is
+        lost, and its time goes on.
 
         Raises:
             can.CanError: the bus fails for good.
@@ -122,7 +122,7 @@ class BusRunner:
         if message.is_error_frame or message.is_extended_id or message.is_fd:
             return
         if self._drive.real_time:
-            # What a frame changes holds from its arrival on.
+            # A change that a frame brings holds from its arrival on.
             self._tick(0.0)
         if message.is_remote_frame:
             self._send(self._drive.request(message.arbitration_id))

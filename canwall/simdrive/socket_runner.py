@@ -1,4 +1,4 @@
-"""A simulated drive at the other end of a socket pair, in steady operation without Python."""
+"""A simulated drive at the other end of a socket pair: no Python in steady operation."""
 
 import functools
 from typing import Any
@@ -27,13 +27,13 @@ from canwall.simdrive.state import DRIVE
 from canwall.simdrive.steady import DECLINED, take
 
 _TICK_NS = 10_000_000
-"""The drive's timers are looked after this often."""
+"""Interval of the ticks that the drive's timers need."""
 
 _SEND_PATIENCE_NS = 1_000_000_000
-"""A master that does not read for so long loses a TPDO."""
+"""A master that does not read for this long loses a TPDO."""
 
-#: The socket, the drive (address of its record), when its protocol time was last told, when it is
-#: to be told again, and a frame that the drive itself has to take.
+#: The socket; address of the drive's record; its last tick, and when the next is due (by
+#: CLOCK_MONOTONIC); a frame that `steady.take` has declined.
 SERVER = np.dtype(
     [
         ("port", PORT, (1,)),
@@ -99,7 +99,7 @@ class SocketRunner(BusRunner):
         record["descriptor"] = bus.fileno()
         place_port(record["port"][0])
         self.compiled = CFunction(int(_serve_function().address), record.ctypes.data)
-        """What compiled code calls instead of `poll`."""
+        """The function for compiled code to call; where it returns 0, `poll` has to go on."""
 
     def poll(self) -> None:
         """Handle every frame that is waiting, without blocking, and the timers.

@@ -42,7 +42,7 @@ OBJECTS = (
     RATED_TORQUE,
 ) = range(len(OBJECTS))
 
-#: Those that change from SYNC to SYNC while nothing but the torque does.
+#: Those that change from SYNC to SYNC in steady operation.
 CYCLIC_OBJECTS = tuple(
     OBJECTS[place] for place in (POSITION, VELOCITY, TORQUE_DEMAND, TORQUE, CURRENT, TARGET_TORQUE)
 )
@@ -75,7 +75,7 @@ PDO = np.dtype(
 #: of the rated torque as the bus counts them.
 DRIVE = np.dtype(
     [
-        # Whether compiled code may take SYNCs and RPDOs (`steady`).
+        # True if SYNCs and RPDOs are for `steady.take`.
         ("steady", "?"),
         # Protocol time, and what it was at the last tick.
         ("now_ns", "i8"),
@@ -95,8 +95,8 @@ DRIVE = np.dtype(
         ("sync_tpdo_count", "i8"),
         # Objects
         ("values", "i8", (len(OBJECTS),)),
-        # Time of the drive: nominal SYNC period, time that the torque has not been told of, time
-        # since the last SYNC.
+        # Time of the drive: nominal SYNC period, time since the torque was last applied, time since
+        # the last SYNC.
         ("period", "f8"),
         ("passed", "f8"),
         ("without_sync", "f8"),

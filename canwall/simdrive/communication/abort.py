@@ -4,7 +4,7 @@ from enum import IntEnum
 
 
 class AbortCode(IntEnum):
-    """Why an SDO transfer ended; every refused write has its own."""
+    """Reasons for the end of an SDO transfer; every refused write has its own."""
 
     TOGGLE_BIT = 0x05030000
     TIME_OUT = 0x05040000
@@ -36,6 +36,6 @@ class AccessError(Exception):
     """An access to the object dictionary that is refused with an SDO abort code."""
 
     def __init__(self, code: AbortCode) -> None:
-        """Args: code: the code that goes into the abort frame."""
+        """Refuse with the code that goes into the abort frame."""
         super().__init__(f"0x{code:08X} ({code.name})")
         self.code = code

@@ -34,9 +34,9 @@ _COMMUNICATION_PROFILE = range(0x1000, 0x2000)
 
 
 class Entry:
-    """One sub-index: what the EDS says of it, its present value, and who watches it.
+    """One sub-index: its description in the EDS, its present value, and its service.
 
-    ``value`` is an int, a float or (strings and domains) bytes; None: nothing to read yet.
+    ``value`` is an int, a float or (strings and domains) bytes; None: there is none yet.
     ``check`` sees a value before it is stored and raises AccessError to refuse it; ``react`` sees
     it afterwards. Both act on writes from the bus only; the device itself assigns ``value``.
     """
@@ -99,12 +99,12 @@ class Entry:
 
     @property
     def receivable(self) -> bool:
-        """Whether an RPDO may carry it (CiA 306: rww is for process output only)."""
+        """True if an RPDO may carry it (CiA 306: rww is for process output only)."""
         return self.pdo_mapping and self.access in ("rw", "rww", "wo")
 
     @property
     def transmittable(self) -> bool:
-        """Whether a TPDO may carry it (CiA 306: rwr is for process input only)."""
+        """True if a TPDO may carry it (CiA 306: rwr is for process input only)."""
         return self.pdo_mapping and self.access in ("ro", "rw", "rwr", "const")
 
     def allow(self, values: Container[int]) -> "Entry":
@@ -130,7 +130,7 @@ class Entry:
         return self.codec.pack(self.value) if self.codec else bytes(self.value)
 
     def check_download(self, size: int | None) -> None:
-        """Refuse a download that cannot succeed, before its data are here.
+        """Refuse a download that cannot succeed, before its data have come.
 
         Args:
             size: bytes announced, None if unknown.
@@ -179,7 +179,7 @@ class StateEntry(Entry):
     __slots__ = ("_values", "place")
 
     def __init__(self, values: memoryview, place: int, entry: Entry) -> None:
-        """Take the place of an entry that nobody checks or watches yet."""
+        """Replace an entry that has no ``check`` or ``react`` yet."""
         self._values = values
         self.place = place
         super().__init__(
@@ -258,7 +258,7 @@ class Dictionary:
         return other
 
     def __contains__(self, key: Key) -> bool:
-        """Whether the EDS has the sub-index."""
+        """Return True if the EDS has the sub-index."""
         return key in self._entries
 
     def __getitem__(self, key: Key) -> Entry:
@@ -286,10 +286,10 @@ class Dictionary:
         return entry
 
     def supply(self, index: int, subindex: int, value: int) -> None:
-        """Say what the device knows of itself where the EDS is silent.
+        """Supply a property of the device that the EDS leaves out.
 
         It is the power-on value of an entry that has none or zero. Where there is no entry, it is
-        what ``number`` gives the services; the object stays absent from the bus.
+        what ``number`` returns to the services; the object stays absent from the bus.
 
         Raises:
             DictionaryError: the EDS lists it with a type that does not hold the value.
@@ -323,7 +323,7 @@ class Dictionary:
         Args:
             index: object index.
             subindex: sub-index.
-            absent: what holds where the EDS does not list it; such an entry is not on the bus.
+            absent: value where the EDS does not list it; such an entry is not on the bus.
 
         Raises:
             DictionaryError: the EDS lists it with another data type.
@@ -399,7 +399,7 @@ def _variables(od: canopen.ObjectDictionary) -> Iterator[ODVariable]:
 
 
 def _power_on_value(codec: Struct | None, value: Any) -> Any:
-    """Bring a value of the EDS into the entry's type; an EDS without one means zero or empty."""
+    """Convert a value of the EDS to the entry's type; none means zero or empty."""
     if codec is None:
         text = value or b""
         return text.encode() if isinstance(text, str) else bytes(memoryview(text))

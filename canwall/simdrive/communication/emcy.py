@@ -30,15 +30,15 @@ _REGISTER_BITS = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08, 0x8: 0x10, 0xF: 0x80}
 """Bit of 0x1001 by the first digit of the error code: current, voltage, temperature, monitoring
 (communication), manufacturer's."""
 
-# Error code, error register, and in the manufacturer's bytes the object that watches.
+# Error code, error register, and in the manufacturer's bytes the object that detects it.
 _MESSAGE = Struct("<HBHBxx")
 
 
 class EmergencyProducer:
-    """Keeps the errors that are present and tells of each that comes and goes.
+    """Keeps the errors that are present and reports each that comes and goes.
 
-    An error is its code and the (index, sub-index) of the object that watches. It is told once
-    until it has gone. While ``latched`` (the drive is in FAULT) none goes by itself.
+    An error is its code and the (index, sub-index) of the object that detects it. It is reported
+    once until it has gone. While ``latched`` (the drive is in FAULT) none goes by itself.
     """
 
     def __init__(self, dictionary: Dictionary, send: Send) -> None:
@@ -60,7 +60,7 @@ class EmergencyProducer:
         """Errors that have not gone, in the order of their coming."""
         self.latched = False
         self.silent = False
-        """True where NMT forbids EMCY (STOPPED); errors are kept all the same."""
+        """True if NMT forbids EMCY (STOPPED); errors are kept nevertheless."""
 
     def reset(self, *, communication_only: bool) -> None:
         """Start over with an empty history; a fault outlives a reset of the communication."""
@@ -81,14 +81,14 @@ class EmergencyProducer:
             self._history[0].value = code | source[0] << 16
             self._count.value = min(self._count.value + 1, len(self._history))
         self._update()
-        self._tell(code, source)
+        self._report(code, source)
 
     def gone(self, code: int, source: Key) -> None:
         """Report the end of an error, if it is present and not latched."""
         if not self.latched and (code, source) in self.present:
             del self.present[code, source]
             self._update()
-            self._tell(_NO_ERROR, source)
+            self._report(_NO_ERROR, source)
 
     def acknowledge(self) -> None:
         """Drop every error: the fault was reset."""
@@ -96,7 +96,7 @@ class EmergencyProducer:
         if self.present:
             self.present.clear()
             self._update()
-            self._tell(_NO_ERROR, (0, 0))
+            self._report(_NO_ERROR, (0, 0))
 
     def _update(self) -> None:
         register = 0
@@ -105,7 +105,7 @@ class EmergencyProducer:
         self._register.value = register
         self._error_code.value = next(reversed(self.present), (_NO_ERROR,))[0]
 
-    def _tell(self, code: int, source: Key) -> None:
+    def _report(self, code: int, source: Key) -> None:
         cob_id = self._cob_id.value
         if not self.silent and not cob_id & NOT_VALID:
             self._send((cob_id & CAN_ID, _MESSAGE.pack(code, self._register.value, *source)))

@@ -16,7 +16,7 @@ class ErrorBehaviour:
     """
 
     def __init__(self, dictionary: Dictionary, nmt: NmtSlave) -> None:
-        """Args: dictionary: has the entry; nmt: the state that changes."""
+        """Serve the entries of the dictionary; errors change the state of ``nmt``."""
         self._nmt = nmt
         self._class = dictionary.number(*ERROR_BEHAVIOUR, absent=_PRE_OPERATIONAL)
         for subindex in range(1, 255):

@@ -1,4 +1,4 @@
-"""What passes between the services and the bus, and the clock of the protocol timers."""
+"""Frames between services and bus, and the clock of the protocol timers."""
 
 from collections.abc import Callable
 from typing import TypeAlias

@@ -13,9 +13,9 @@ _TOGGLE = 0x80
 
 
 class NodeGuarding:
-    """Answers the guarding master, and watches it from its first remote frame on.
+    """Answers the guarding master, and monitors it from its first remote frame on.
 
-    The node life time is 0x100C (ms) times 0x100D; 0: the master is not watched. A drive without
+    The node life time is 0x100C (ms) times 0x100D; 0: the master is not monitored. A drive without
     0x100C cannot be guarded, and one that sends heartbeats (0x1017) is not.
     """
 
@@ -34,7 +34,7 @@ class NodeGuarding:
             clock: protocol time.
             send: takes the answers.
             lost: called with (index, sub-index) when the life time has run out.
-            regained: called likewise when the master is back, or is not watched any more.
+            regained: called likewise when the master is back, or is not monitored any more.
         """
         self._clock = clock
         self._send = send
@@ -50,12 +50,12 @@ class NodeGuarding:
         self.reset()
 
     def reset(self) -> None:
-        """Begin with toggle bit 0, and wait for the first remote frame again."""
+        """Start with toggle bit 0, and wait for the first remote frame again."""
         self._toggle = 0
         self._deadline_ns: int | None = None
 
     def routes(self, nmt_state: int) -> dict[int, Callable[[], None]]:
-        """Return who answers the guarding master's remote frames, by CAN-ID."""
+        """Return the function that answers the guarding master's remote frames, by CAN-ID."""
         return {self._can_id: lambda: self._guard(nmt_state)} if self._supported else {}
 
     def tick(self) -> None:

@@ -10,7 +10,7 @@ from canwall.simdrive.communication.dictionary import Dictionary, Entry, Key
 from canwall.simdrive.communication.frame import NS_PER_MS, Clock, Send
 
 Report: TypeAlias = Callable[[Key], None]
-"""Told of an entry by its (index, sub-index)."""
+"""Called with the (index, sub-index) of an entry."""
 
 _NMT_STATE = 0x7F
 _BOOT_UP = 0
@@ -29,7 +29,7 @@ class HeartbeatProducer:
         self.reset()
 
     def reset(self) -> None:
-        """Begin a new period now, with the time in 0x1017."""
+        """Start a new period now, with the time in 0x1017."""
         self._period_ns = self._time_ms.value * NS_PER_MS
         self._due_ns = self._clock.now_ns + self._period_ns
 
@@ -38,7 +38,7 @@ class HeartbeatProducer:
         self._send((self._can_id, bytes([_BOOT_UP])))
 
     def tick(self, nmt_state: int) -> None:
-        """Send what is due; periods that were slept through are not made up for."""
+        """Send the heartbeat that is due; missed periods are not made up for."""
         now_ns = self._clock.now_ns
         if self._period_ns and now_ns >= self._due_ns:
             self._send((self._can_id, bytes([nmt_state])))
@@ -48,9 +48,9 @@ class HeartbeatProducer:
 
 
 class HeartbeatConsumer:
-    """Watches the nodes of 0x1016, each from its first heartbeat on.
+    """Monitors the nodes of 0x1016, each from its first heartbeat on.
 
-    A boot-up message is no heartbeat: a master that restarts goes missing like one that died.
+    A boot-up message is no heartbeat: a master that restarts is missed like one that died.
     """
 
     def __init__(
@@ -66,53 +66,53 @@ class HeartbeatConsumer:
         Args:
             dictionary: has the entries.
             clock: protocol time.
-            changed: called when other nodes are to be watched.
+            changed: called when other nodes are to be monitored.
             lost: called with the (index, sub-index) of the entry whose time has run out.
-            regained: called with the entry whose node is back, or is not watched any more.
+            regained: called with the entry whose node is back, or is not monitored any more.
         """
         self._changed = changed
-        self._watches = [
+        self._nodes = [
             _MonitoredNode(dictionary[0x1016, subindex], clock, lost, regained)
             for subindex in range(1, 128)
             if (0x1016, subindex) in dictionary
         ]
-        for watch in self._watches:
-            watch.entry.check = partial(self._check, watch)
-            watch.entry.react = partial(self._react, watch)
+        for node in self._nodes:
+            node.entry.check = partial(self._check, node)
+            node.entry.react = partial(self._react, node)
 
     def reset(self) -> None:
         """Wait for the first heartbeat of every node again."""
-        for watch in self._watches:
-            watch.deadline_ns = None
+        for node in self._nodes:
+            node.deadline_ns = None
 
     def routes(self) -> dict[int, Callable[[bytes], None]]:
-        """Return who takes the frames of the nodes that are watched, by CAN-ID."""
+        """Return the receiver of the heartbeats of each monitored node, by CAN-ID."""
         return {
-            ERROR_CONTROL + _node_id(watch.entry.value): watch.receive
-            for watch in self._watches
-            if _is_used(watch.entry.value)
+            ERROR_CONTROL + _node_id(node.entry.value): node.receive
+            for node in self._nodes
+            if _is_used(node.entry.value)
         }
 
     def tick(self) -> None:
         """Report the nodes that have been silent for too long, once."""
-        for watch in self._watches:
-            watch.tick()
+        for node in self._nodes:
+            node.tick()
 
-    def _check(self, watch: "_MonitoredNode", value: int) -> None:
+    def _check(self, node: "_MonitoredNode", value: int) -> None:
         if value >> 24 or _node_id(value) > 127:
             raise AccessError(AbortCode.INVALID_VALUE)
-        others = [other.entry.value for other in self._watches if other is not watch]
-        watched = [_node_id(other) for other in others if _is_used(other)]
-        if _is_used(value) and _node_id(value) in watched:
+        others = [other.entry.value for other in self._nodes if other is not node]
+        monitored = [_node_id(other) for other in others if _is_used(other)]
+        if _is_used(value) and _node_id(value) in monitored:
             raise AccessError(AbortCode.INCOMPATIBLE_PARAMETER)
 
-    def _react(self, watch: "_MonitoredNode", _: int) -> None:
-        watch.stop()
+    def _react(self, node: "_MonitoredNode", _: int) -> None:
+        node.stop()
         self._changed()
 
 
 class _MonitoredNode:
-    """One node under watch: bits 16 to 23 of the entry are its ID, bits 0 to 15 the time in ms."""
+    """One monitored node: bits 16 to 23 of the entry are its ID, bits 0 to 15 the time in ms."""
 
     def __init__(self, entry: Entry, clock: Clock, lost: Report, regained: Report) -> None:
         self.entry = entry

@@ -29,7 +29,7 @@ _INQUIRE_IDENTITY = range(0x5A, 0x5E)
 _INQUIRE_NODE_ID = 0x5E
 
 _IDENTIFYING = ((0, eq), (1, eq), (2, ge), (2, le), (3, ge), (3, le))
-"""Which number of the LSS address each request is about, and how it compares."""
+"""Number of the LSS address in each request, and its comparison."""
 
 _WAITING, _CONFIGURATION = range(2)
 _START_OF_SCAN = 0x80
@@ -45,7 +45,7 @@ _BIT_RATES = {1_000_000: 0, 800_000: 1, 500_000: 2, 250_000: 3, 125_000: 4, 50_0
 
 
 class LssSlave:
-    """Configures in CONFIGURATION; in WAITING it is found, and heeds the switching of the state.
+    """Is configured in CONFIGURATION; in WAITING, found and switched to the other state.
 
     The LSS address is the identity object: vendor-ID, product code, revision and serial number.
     """
@@ -135,9 +135,9 @@ class LssSlave:
             self._answer(_IDENTIFIED)
 
     def _fast_scan(self, number: int, bit: int, place: int, following: int) -> None:
-        """Tell whether the upper bits of one number of the address, down to ``bit``, match.
+        """Answer if the upper bits of one number of the address, down to ``bit``, match.
 
-        Whose four numbers match to the last bit, in their order, is selected.
+        The device whose four numbers match to the last bit, in their order, is selected.
         """
         if bit == _START_OF_SCAN:
             self._scanned = 0

@@ -1,4 +1,4 @@
-"""What outlives a reset and, in a file, the process: the node-ID of LSS, and stored parameters."""
+"""Non-volatile memory: the node-ID of LSS, and stored parameters."""
 
 import json
 from pathlib import Path
@@ -17,20 +17,20 @@ _IDENTITY = 0x1018
 
 
 class Memory:
-    """Non-volatile memory: a file, or, without one, what lasts as long as the process."""
+    """Values that outlive a reset and, in a file, the process."""
 
     def __init__(self, path: Path | None) -> None:
         """Read the file, which need not exist yet.
 
         Raises:
-            DictionaryError: the file is none that a drive has written.
+            DictionaryError: no drive has written the file.
         """
         self._path = path
         self._identity: list[int] | None = None
         self._owner: int | None = None
         self._objects: dict[Key, bytes] = {}
         self.node_id: int | None = None
-        """1 to 127 or UNCONFIGURED, as LSS has left it; None: it never did."""
+        """1 to 127 or UNCONFIGURED, as LSS has stored it; None: it has not."""
         if path and path.exists():
             self._read(path)
 
@@ -39,7 +39,7 @@ class Memory:
 
         A COB-ID whose entry has the node-ID in its default belongs to the predefined connection
         set for as long as it has the default identifier. Then it follows the node-ID, with the
-        bits 29 to 31 that were stored; one that was chosen freely stays what it is. (CiA 301,
+        bits 29 to 31 that were stored; one that was chosen freely stays as it is. (CiA 301,
         7.3.5: the set is a function of the node-ID; CiA 306: $NODEID.)
 
         Raises:
@@ -129,7 +129,7 @@ def _identity(dictionary: Dictionary) -> list[int]:
 
 
 def _renumbered(former: Entry, present: Entry, data: bytes) -> bytes:
-    """Return a stored value for another node-ID: what each entry defaults to says how."""
+    """Return a stored value for another node-ID, which the defaults of the entries differ by."""
     if former.default == present.default or former.codec is None:
         return data
     value: int = former.decode(data)

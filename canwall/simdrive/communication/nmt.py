@@ -23,7 +23,7 @@ _RESET_COMMUNICATION = 130
 
 
 class NmtSlave:
-    """Obeys the commands for this node and for all; leaves what they mean to its owner."""
+    """Obeys the commands for this node and for all; its owner carries them out."""
 
     def __init__(
         self,
@@ -47,7 +47,7 @@ class NmtSlave:
         self._reset = reset
 
     def receive(self, data: bytes) -> None:
-        """Take an NMT message; what is no command to this node is ignored."""
+        """Take an NMT message; other than commands to this node are ignored."""
         if len(data) != 2 or data[1] not in self._addresses:
             return
         command = data[0]

@@ -1,4 +1,4 @@
-"""What receive and transmit PDOs share: communication and mapping parameter (CiA 301, 7.5.2.35-38).
+"""Receive and transmit PDOs: communication and mapping parameter (CiA 301, 7.5.2.35 to 7.5.2.38).
 
 The order that CiA 301 prescribes is kept: COB-ID invalid (bit 31), number of mapped objects 0,
 mapping entries, number of mapped objects, COB-ID valid. Anything else gets DEVICE_STATE.
@@ -95,17 +95,17 @@ class Pdo:
 
     @property
     def valid(self) -> bool:
-        """Whether bit 31 of the COB-ID is clear."""
+        """True if bit 31 of the COB-ID is clear."""
         return not self._cob_id.value & NOT_VALID
 
     @property
     def active(self) -> bool:
-        """Whether the PDO is valid and carries something."""
+        """True if the PDO is valid and carries something."""
         return self.valid and self._count.value > 0
 
     @property
     def synchronous(self) -> bool:
-        """Whether SYNC moves the PDO."""
+        """True if SYNC triggers the PDO."""
         return self._type.value not in (EVENT_DRIVEN_REMOTE, *EVENT_DRIVEN)
 
     @property

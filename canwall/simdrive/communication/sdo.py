@@ -19,7 +19,7 @@ _EXPEDITED_SIZE = 4
 _MAX_SIZE = 1 << 16
 """Bytes that a string or domain may be given; the device's memory, so to say."""
 _TIME_OUT_NS = 1000 * NS_PER_MS
-"""How long a transfer waits for the client's next frame."""
+"""Time that a transfer waits for the client's next frame."""
 
 # Client and server command specifiers, in bits 5 to 7 of the first byte.
 (
@@ -98,7 +98,7 @@ class SdoServer:
         }
 
     def reset(self) -> None:
-        """Forget the transfer under way."""
+        """Drop the transfer in progress."""
         self._transfer = None
 
     def receive(self, data: bytes) -> None:

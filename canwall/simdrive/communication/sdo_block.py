@@ -35,7 +35,7 @@ class BlockDownload:
         """
         self.entry = entry
         self.in_block = True
-        """Whether the next frame is a segment."""
+        """True if the next frame is a segment."""
         self._size = size
         self._with_crc = with_crc
         self._max_size = max_size
@@ -92,7 +92,7 @@ class BlockUpload:
         Args:
             entry: what is read.
             value: of it.
-            block_size: segments that the client takes at once.
+            block_size: segments that the client takes in a block.
 
         Raises:
             AccessError: INVALID_BLOCK_SIZE.

@@ -12,7 +12,7 @@ _RESTORE = 0x1011
 _SAVE = int.from_bytes(b"save", "little")
 _LOAD = int.from_bytes(b"load", "little")
 _ON_COMMAND = 1
-"""What the sub-indices read: parameters are stored, and restored, on command."""
+"""Value of the sub-indices: parameters are stored, and restored, on command."""
 
 _GROUPS = {
     1: range(0x1000, 0x10000),
@@ -20,22 +20,21 @@ _GROUPS = {
     3: range(0x6000, 0xA000),
 }
 _MANUFACTURER = range(0x2000, 0x6000)
-"""What every further sub-index is for."""
+"""Parameters of every further sub-index."""
 
 _NOT_PARAMETERS = frozenset((0x1003, _STORE, _RESTORE, 0x5F00, 0x6040, 0x6071))
-"""History, commands, faults asked for and targets: whatever was stored, nothing moves by itself
-after power-on."""
+"""History, commands, requested faults and targets: nothing moves by itself after power-on."""
 
 
 class ParameterStore:
-    """Values that go before those of the EDS at every reset, until they are restored."""
+    """Values that replace those of the EDS at every reset, until they are restored."""
 
     def __init__(self, dictionary: Dictionary, memory: Memory) -> None:
         """Serve 0x1010 and 0x1011 of the dictionary.
 
         Args:
             dictionary: has the entries.
-            memory: what keeps the values.
+            memory: keeps the values.
 
         Raises:
             DictionaryError: the memory holds the values of another device.
@@ -62,7 +61,7 @@ class ParameterStore:
         entry.react = lambda _: setattr(entry, "value", entry.default)
 
     def _check(self, signature: int, group: range, value: int) -> None:
-        """Obey a signature: what cannot be stored is refused like a wrong one."""
+        """Obey a signature; a wrong one, and values that cannot be stored, are refused."""
         if value != signature:
             raise AccessError(AbortCode.NOT_STORED)
         kept = {key: data for key, data in self._stored.items() if key[0] not in group}

@@ -50,7 +50,7 @@ class SyncConsumer:
         Args:
             dictionary: has the entries.
             state: of the drive.
-            emcy: told of SYNCs of the wrong length, and of those that come again.
+            emcy: reports SYNCs of the wrong length, and SYNCs that are back.
             changed: called when the CAN-ID was written.
             lost: called with error code and (index, sub-index) when SYNC is missed.
         """
@@ -89,13 +89,13 @@ class SyncConsumer:
         self.stop()
 
     def stop(self) -> None:
-        """Forget the SYNCs that have come."""
+        """Wait for the first SYNC again."""
         self.counter = 0
-        """Of the last SYNC; 0: it carries none."""
+        """Counter of the last SYNC; 0: it carries none."""
         self._state.sync_deadline_ns = self._state.sync_window_end_ns = NEVER
 
     def receive(self, data: bytes) -> bool:
-        """Take a SYNC; return whether it is one, of the length that 0x1019 demands."""
+        """Take a SYNC; return False if it is not of the length that 0x1019 demands."""
         if len(data) != self._length:
             self._emcy.occurred(SYNC_LENGTH, _COUNTER_OVERFLOW)
             return False
@@ -114,7 +114,7 @@ class SyncConsumer:
             self._lost(SYNC_LOST, _CYCLE_PERIOD)
 
     def _check_cob_id(self, value: int) -> None:
-        check_can_id(value & ~NOT_VALID)  # bit 31 means nothing here
+        check_can_id(value & ~NOT_VALID)  # bit 31 has no meaning here
         if value & BIT_30:
             raise AccessError(AbortCode.INVALID_VALUE)
 

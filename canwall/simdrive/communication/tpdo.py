@@ -21,7 +21,7 @@ class Tpdo(Pdo):
     Or only when a remote frame asks for it, with the content of the last SYNC (252) or the present
     one (253). Others answer remote frames as well, while bit 30 of their COB-ID is clear.
     With a SYNC counter, the first of every n-th waits for the SYNC start value (0x1800:06).
-    An event is a change of what is mapped. It is sent with the next SYNC (type 0), or at once
+    An event is a change of the mapped values. It is sent with the next SYNC (type 0), or directly
     (254, 255), no sooner than the inhibit time after the last; the event timer sends without one.
     """
 
@@ -83,7 +83,7 @@ class Tpdo(Pdo):
         return constant and not self._event_ns and self._sent == self._payload()
 
     def configure(self) -> None:
-        """Compile the mapping and begin anew."""
+        """Compile the mapping and start over."""
         super().configure()
         self._inhibit_ns = self._inhibit_time.value * NS_PER_100_US
         self._event_ns = self._event_time.value * NS_PER_MS
@@ -94,7 +94,7 @@ class Tpdo(Pdo):
         self.start()
 
     def start(self) -> None:
-        """Begin anew, as on entering OPERATIONAL: the present content counts as an event."""
+        """Start over, as on entering OPERATIONAL: the present content counts as an event."""
         self._syncs = 0
         self._awaited = self._start_value.value
         self._sent: bytes | None = None
@@ -103,7 +103,7 @@ class Tpdo(Pdo):
         self._inhibited_until_ns = 0
 
     def sync(self, counter: int) -> None:
-        """Send what is due with this SYNC, which has a counter or 0."""
+        """Send with this SYNC if it is due; ``counter`` is 0 where SYNC has none."""
         if self._divider is None:
             payload = self._payload()
             if self._sampled:
@@ -122,7 +122,7 @@ class Tpdo(Pdo):
             self._send((self._frame_id, self._payload()))
 
     def poll(self) -> None:
-        """Send an event-driven PDO if there is reason to and time has come."""
+        """Send an event-driven PDO if its content has changed or its timer has run out."""
         payload = self._payload()
         now_ns = self._state.now_ns
         timer_due = self._event_ns and now_ns >= self._event_due_ns

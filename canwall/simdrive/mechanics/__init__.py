@@ -1,1 +1,1 @@
-"""What turns: motor, current loop, encoder, handle and hand, and the way of the torque to them."""
+"""Motor, current loop, encoder, handle and hand, and the path of the torque to them."""

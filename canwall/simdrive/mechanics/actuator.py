@@ -1,4 +1,4 @@
-"""From the torque that the drive demands to the motion: what follows of it, after a pure delay."""
+"""From demanded torque to motion: the part that acts, after a pure delay."""
 
 from collections import deque
 
@@ -6,7 +6,7 @@ from canwall.simdrive.profile.feedback import Motion
 
 
 class Actuator:
-    """Moves the motion on under the torque that was demanded, each change of it a delay later.
+    """Moves the motion on under the demanded torque, each change of it a delay later.
 
     Times are in SYNC periods, so that a delay of whole periods ends exactly with a SYNC.
     """

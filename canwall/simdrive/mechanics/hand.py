@@ -1,4 +1,4 @@
-"""The hand on the simulated drive's handle: what it wants, period by period.
+"""The hand on the simulated drive's handle: its force, period by period.
 
 The hand is a mass, a spring and a damper about a moving hand position, and a muscle torque
 (theory, section 1). By its script it strikes: it goes to where it presses, stays, and withdraws.
@@ -18,12 +18,12 @@ Array = NDArray[np.float64]
 
 
 def _least_jerk(s: Array) -> Array:
-    """From rest at 0 to rest at 1 in unit time."""
+    """Return the way from rest at 0 to rest at 1 in unit time."""
     return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
 
 
 def pressing(hand: Hand, period_s: float, periods: int, first: int = 0) -> Array:
-    """How far the hand has gone from resting (0) to pressing (1), at SYNC first … first + periods.
+    """Return how far the hand is from resting (0) to pressing (1), at SYNC first … first + periods.
 
     Shape (periods + 1,). Each strike takes approach_s, press_s and withdraw_s; after the last one
     the hand rests.
@@ -43,7 +43,7 @@ def _instants(period_s: float, periods: int, first: int) -> Array:
 
 
 def random_moves(strikes: RandomStrikes, rest_rad: float) -> list[Move]:
-    """The strikes of a seed as a script: rest, approach, press, rest, release, and again."""
+    """Return the strikes of a seed as a script: rest, approach, press, rest, release, and again."""
     draw = np.random.default_rng(strikes.seed).uniform
     moves = []
     for _ in range(strikes.strikes):
@@ -70,7 +70,7 @@ def random_moves(strikes: RandomStrikes, rest_rad: float) -> list[Move]:
 
 @dataclass(frozen=True)
 class _Knots:
-    """Where the hand is at rest on its way; between two of them it moves with the least jerk."""
+    """Instants of rest on the way of the hand, which moves with the least jerk between two."""
 
     times: Array
     positions: Array
@@ -100,7 +100,7 @@ class _Knots:
         return cls(*np.array(knots).T)
 
     def at(self, t: Array) -> tuple[Array, Array]:
-        """Hand position [rad] and muscle torque [N·m] at times t; after the last knot as there."""
+        """Return hand position [rad] and muscle torque [N·m] at times t; the last ones stay."""
         stage = np.interp(t, self.times, np.arange(len(self.times), dtype=np.float64))
         knot = np.minimum(stage.astype(np.int64), len(self.times) - 2)
         share = _least_jerk(stage - knot)
@@ -111,7 +111,7 @@ class _Knots:
 
 
 def _path_and_torque(hand: Hand, period_s: float, periods: int, first: int) -> tuple[Array, Array]:
-    """Hand position [rad] and muscle torque [N·m] at SYNC first … first + periods.
+    """Return hand position [rad] and muscle torque [N·m] at SYNC first … first + periods.
 
     Both (periods + 1,).
     """
@@ -126,17 +126,16 @@ def _path_and_torque(hand: Hand, period_s: float, periods: int, first: int) -> t
 
 
 def hand_path(hand: Hand, period_s: float, periods: int, first: int = 0) -> Array:
-    """Hand position [rad] at SYNC first … first + periods; shape (periods + 1,)."""
+    """Return the hand position [rad] at SYNC first … first + periods; shape (periods + 1,)."""
     return _path_and_torque(hand, period_s, periods, first)[0]
 
 
 def hand_force(hand: Hand, period_s: float, periods: int, first: int = 0) -> tuple[Array, Array]:
-    """Force of the hand on the handle, (u₀, u₁) of u₀ + u₁·t in each period; both (periods,).
+    """Return the force of the hand on the handle, (u₀, u₁) of u₀ + u₁·t in each period.
 
-    They are the periods that begin with SYNC `first` and those after it.
-
-    u₀ [N·m] and u₁ [N·m/s] on the drive's axis. The part that depends on the handle's own
-    position and velocity is not in it: it is the plant's (`motion.hand_plant`).
+    The periods are those from SYNC `first` on. Shape of both (periods,); u₀ [N·m] and u₁ [N·m/s]
+    on the drive's axis. The part that depends on the handle's own position and velocity belongs to
+    the plant (`servo.hand_plant`).
     """
     path, torque = _path_and_torque(hand, period_s, periods, first)
     speed = np.diff(path) / period_s

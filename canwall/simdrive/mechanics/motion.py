@@ -1,4 +1,4 @@
-"""Motor, encoder and the hand on the handle: what the simulated drive moves and measures."""
+"""Motor, encoder and the hand on the handle, as the simulated drive moves and measures them."""
 
 import math
 from typing import Protocol, runtime_checkable

@@ -12,7 +12,7 @@ from canwall.compiled import Record, compiled
 from canwall.config import Simulation
 from canwall.physics import PLANT, Force, Grasp, HandBody, advance, advance_grasp, make_plant
 
-#: Plants (the handle alone, and joined with the hand), the hand as a body of its own, the current
+#: Plants (the handle alone, and joined with the hand), the hand as a separate body, the current
 #: loop, and the state: position and velocity of handle and hand, torque of the motor. SI units.
 SERVO = np.dtype(
     [
@@ -38,7 +38,7 @@ SERVO = np.dtype(
 
 
 def handle_plant(simulation: Simulation) -> dict[str, float]:
-    """The handle without the hand, as keywords of `physics.make_plant`: rotor and what turns."""
+    """Return the handle without the hand, as keywords of `physics.make_plant`."""
     return {
         "mass": simulation.inertia_kg_m2,
         "viscous": simulation.viscous_nm_s_per_rad,
@@ -49,7 +49,7 @@ def handle_plant(simulation: Simulation) -> dict[str, float]:
 
 
 def hand_plant(simulation: Simulation) -> dict[str, float]:
-    """What moves, as keywords of `physics.make_plant`: drive, handle and hand as one."""
+    """Return drive, handle and hand as one plant, as keywords of `physics.make_plant`."""
     hand, handle = simulation.hand, handle_plant(simulation)
     return handle | {
         "mass": handle["mass"] + hand.inertia_kg_m2,
@@ -59,7 +59,7 @@ def hand_plant(simulation: Simulation) -> dict[str, float]:
 
 
 def hand_body(simulation: Simulation) -> HandBody:
-    """The hand as a body of its own, for a hand that can lose the handle."""
+    """Return the hand as a separate body, for a hand that can lose the handle."""
     hand = simulation.hand
     return HandBody(
         hand.inertia_kg_m2, hand.damping_nm_s_per_rad, hand.stiffness_nm_per_rad, hand.side
@@ -67,7 +67,7 @@ def hand_body(simulation: Simulation) -> HandBody:
 
 
 def make_servo(simulation: Simulation, counts_per_rev: float) -> NDArray[np.void]:
-    """One servo at rest where its hand rests; shape (1,), dtype SERVO."""
+    """Return one servo at rest where its hand rests; shape (1,), dtype SERVO."""
     servo = np.zeros(1, SERVO)
     servo["handle"] = make_plant(**handle_plant(simulation))
     servo["joined"] = make_plant(**hand_plant(simulation))
@@ -85,7 +85,7 @@ def make_servo(simulation: Simulation, counts_per_rev: float) -> NDArray[np.void
 
 @compiled
 def encoder_counts(servos: NDArray[np.void]) -> int:
-    """Encoder position [increments], the nearest one."""
+    """Return the encoder position [increments], the nearest one."""
     servo: Record = servos[0]
     return math.floor(servo.y * servo.counts_per_rad + 0.5)
 
@@ -96,9 +96,9 @@ def move_servo(
 ) -> int:
     """Move on under a torque that is demanded meanwhile, and a hand that pushes push + slope·t.
 
-    servos has dtype SERVO and shape (1,). Returns where the encoder is then [increments]. The
-    hand's push is what does not depend on where the handle is. The current loop knows torques in
-    steps and follows as a first-order lag.
+    servos has dtype SERVO and shape (1,). Returns the encoder position at the end [increments].
+    The hand's push is the part of its force that does not depend on the handle's position. The
+    current loop quantizes the torque and follows as a first-order lag.
     """
     servo: Record = servos[0]
     demand = torque

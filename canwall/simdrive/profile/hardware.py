@@ -1,4 +1,4 @@
-"""What motor, power stage and wiring are like: what no object of the dictionary says."""
+"""Motor, power stage and wiring: the properties that no object of the dictionary has."""
 
 import math
 from dataclasses import dataclass
@@ -8,15 +8,16 @@ from dataclasses import dataclass
 class Hardware:
     """One installation.
 
-    counts_per_rad: encoder increments per radian of the shaft with the handle.
-    gear_ratio: revolutions of the motor per revolution of that shaft (0x6091).
-    inertia_kg_m2: of drive and handle at that shaft; the velocity controller is tuned to it.
-    peak_torque_nm: motor torque that the current limit allows; None: three times rated torque.
-    overload_s: how long the I²t monitoring lets the peak torque pass before it falls back to
-        rated torque [s].
-    dc_link_v: voltage of the DC link [V].
-    negative_limit, positive_limit: where the limit switches close, None: there are none; and
-    home: between which positions the home switch is closed. In increments of the encoder.
+    Attributes:
+        counts_per_rad: encoder increments per radian of the shaft with the handle.
+        gear_ratio: revolutions of the motor per revolution of that shaft (0x6091).
+        inertia_kg_m2: of drive and handle at that shaft; the velocity controller is tuned to it.
+        peak_torque_nm: motor torque that the current limit allows; None: three times the rated one.
+        overload_s: time that the I²t monitoring allows the peak torque [s].
+        dc_link_v: voltage of the DC link [V].
+        negative_limit: position where the limit switch closes [increments]; None: there is none.
+        positive_limit: likewise.
+        home: positions between which the home switch is closed [increments]; None: there is none.
     """
 
     counts_per_rad: float = 131072 / (2.0 * math.pi)

@@ -18,7 +18,7 @@ _ERROR = 1 << 13
 class Homing:
     """Starts on the edge of bit 4 of the controlword; shows bits 10, 12 and 13 of the statusword.
 
-    Those of other methods that a dictionary begins with end in a homing error.
+    Other methods, which a dictionary may begin with, end in a homing error.
     """
 
     def __init__(self, dictionary: Dictionary, feedback: Feedback) -> None:
@@ -36,7 +36,7 @@ class Homing:
         """The mode's bits of the statusword: at first, not started."""
 
     def stop(self) -> None:
-        """The mode is left, or the operation: not started."""
+        """Reset to not started: the mode or the operation has ended."""
         self._started = False
         self.status = _TARGET_REACHED
 

@@ -8,7 +8,7 @@ NEGATIVE_LIMIT, POSITIVE_LIMIT, HOME, INTERLOCK = (1 << bit for bit in range(4))
 
 
 class DigitalInputs:
-    """The switches that the axis passes, and the input that takes the torque off.
+    """The switches that the axis passes, and the input for safe torque off.
 
     A limit switch stays closed beyond the position where it closes.
     """

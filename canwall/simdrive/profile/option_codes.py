@@ -20,7 +20,7 @@ QUICK_STOP, SHUTDOWN, DISABLE_OPERATION, HALT, FAULT_REACTION = range(0x605A, 0x
 
 
 class Ramp(Enum):
-    """How the motion comes to its end."""
+    """Ways to end a motion."""
 
     MOTOR_FREE = auto()
     SLOW_DOWN = auto()
@@ -39,14 +39,14 @@ _SERVED = {
     HALT: (1, _RAMPS),
     FAULT_REACTION: (2, {0: Ramp.MOTOR_FREE, **_RAMPS}),
 }
-"""The standard's default, and what each value means."""
+"""The standard's default, and the ramp of each value."""
 
 
 class OptionCode:
     """One of 0x605A to 0x605E.
 
-    What a dictionary begins with may be its maker's own value (0x605D = 0, say): the motor is
-    free then, and it may be written back.
+    The power-on value may be one of the manufacturer (0x605D = 0, say): then the motor is free,
+    and the value may be written back.
     """
 
     def __init__(self, dictionary: Dictionary, index: int) -> None:
@@ -65,15 +65,15 @@ class OptionCode:
 
     @property
     def ramp(self) -> Ramp:
-        """What it asks for."""
+        """The ramp that it selects."""
         return self._ramps.get(self._entry.value, Ramp.MOTOR_FREE)
 
     @property
     def disables(self) -> bool:
-        """Of the quick stop: whether the drive function is disabled at once (0)."""
+        """Of the quick stop: True if the drive function is disabled immediately (0)."""
         return bool(self._entry.value == 0)
 
     @property
     def stays(self) -> bool:
-        """Of the quick stop: whether the drive stays in QUICK STOP ACTIVE (5 to 7)."""
+        """Of the quick stop: True if the drive stays in QUICK STOP ACTIVE (5 to 7)."""
         return self._entry.value in _STAYING

@@ -1,4 +1,4 @@
-"""The unit of 0x6064: encoder increments, or what the factor group makes of them.
+"""The unit of 0x6064: encoder increments, or another by the factor group.
 
 Position = increments × feed constant / (encoder resolution × gear ratio) (CiA 402-2), where the
 feed constant is 0x6092, or follows from a unit of angle in 0x60A8.
@@ -35,7 +35,7 @@ def _pair(dictionary: Dictionary, index: int) -> tuple[Entry, Entry]:
 
 
 class PositionUnit:
-    """Serves the factor group. A drive that nobody told its encoder (1/1) counts increments."""
+    """Serves the factor group. A drive with an encoder of 1/1 shows increments."""
 
     def __init__(self, dictionary: Dictionary, state: DriveState) -> None:
         """Serve the objects of the dictionary; begin with increments."""

@@ -45,7 +45,7 @@ _FASTEST_SLOPE = 1 << 31
 
 
 class PowerDriveSystem:
-    """State machine and mode of operation of the one axis, and what they make of the parts."""
+    """State machine and mode of operation of the axis, which steer all its parts."""
 
     def __init__(
         self,
@@ -62,12 +62,12 @@ class PowerDriveSystem:
             dictionary: of this drive.
             state: of this drive.
             motion: motor, encoder and hand.
-            emcy: tells of faults.
-            hardware: what the dictionary does not say.
+            emcy: reports faults.
+            hardware: properties that the dictionary does not have.
             period_s: of the SYNC, in seconds; the drive's own control goes by it.
 
         Raises:
-            DictionaryError: one of them is of no use.
+            DictionaryError: the type or value of one of them is not served.
         """
         self._state = state.fields
         self._emcy = emcy
@@ -91,7 +91,7 @@ class PowerDriveSystem:
         self._ramp: Ramp | None = None
         self._slope_torque = 0.0
         self._produce: Callable[[float], None] | None = None
-        """Gives the torque; None: the motor is free."""
+        """Demands the torque; None: the motor is free."""
         self._slowing_in = NO_MODE
         self._obeyed: int | None = None
         self._halted = self._follows_target = self._homes = False
@@ -115,7 +115,7 @@ class PowerDriveSystem:
         self.sample()
 
     def disable(self) -> None:
-        """Take the torque away at once, whatever the state."""
+        """Disable the voltage, whatever the state."""
         self.state_machine.command(Command.DISABLE_VOLTAGE)
 
     def abort_connection(self, code: int, source: Key) -> None:
@@ -123,7 +123,7 @@ class PowerDriveSystem:
 
         Args:
             code: error code, for the fault.
-            source: (index, sub-index) of the object that noticed.
+            source: (index, sub-index) of the object that detected it.
         """
         if not self.state_machine.powered:
             return
@@ -140,7 +140,7 @@ class PowerDriveSystem:
 
         Args:
             code: error code of the EMCY and of 0x603F.
-            source: (index, sub-index) of the object that noticed.
+            source: (index, sub-index) of the object that detected it.
         """
         self._latch(code, source)
         self.state_machine.fault()
@@ -148,8 +148,8 @@ class PowerDriveSystem:
     def sto(self, active: bool) -> None:
         """Set the input of safe torque off (0x60FD bit 3).
 
-        A powered motor is free at once and the drive goes into FAULT without a slow-down, and so
-        it does when it is enabled meanwhile. As with maxon's EPOS4 (STO error), the error comes
+        A powered motor is free immediately and the drive goes into FAULT without a slow-down, as it
+        does when it is enabled meanwhile. As with maxon's EPOS4 (STO error), the error comes
         with the power stage, not with the input alone, and no fault reset succeeds before the
         input is released. CiA 301 has no code for it: 0x9000 is its external error.
         """
@@ -173,7 +173,7 @@ class PowerDriveSystem:
 
     @property
     def slowing_down(self) -> bool:
-        """Whether the drive brakes by itself, and has not come to rest."""
+        """True while the drive brakes by itself, and has not come to rest."""
         return self._ramp is not None and not self._slow_down.done
 
     @property
@@ -183,7 +183,7 @@ class PowerDriveSystem:
 
     @property
     def motor_free(self) -> bool:
-        """Whether there is no torque, whatever is demanded."""
+        """True if there is no torque, whatever is demanded."""
         return self._produce is None
 
     @property
@@ -199,7 +199,7 @@ class PowerDriveSystem:
         """Let the torque that is due take effect: it is demanded from now on.
 
         Args:
-            passed_s: time since it was last done, in seconds: a slope goes on by as much.
+            passed_s: time since the last call, in seconds, for the slope.
         """
         self._torque.pass_time(passed_s)
         if self._produce is not None:
@@ -233,7 +233,7 @@ class PowerDriveSystem:
         self._reached = self._slow_down.done
 
     def _at_rest(self) -> bool:
-        """Whether the slow-down is done: the axis stands, or the torque is gone along 0x6087."""
+        """Return True if the slow-down is done: standstill, or no torque left along 0x6087."""
         return self._slope_torque == 0.0 if self._slopes else self._slow_down.done
 
     def _control(self, controlword: int) -> None:
@@ -243,7 +243,7 @@ class PowerDriveSystem:
             and machine.state is PdsState.OPERATION_ENABLED
             and machine.ramp is None
         ):
-            return  # as nearly always in the cycle: it has been obeyed
+            return  # obeyed already, as nearly always in the cycle
         self._obeyed = controlword
         machine.control(controlword)
         self._refresh()
@@ -303,7 +303,7 @@ class PowerDriveSystem:
         self._emcy.latched = True
 
     def _check_supplies(self) -> None:
-        """Leave the operation if there is nothing to operate with."""
+        """Go into FAULT if a supply that the operation needs is missing."""
         machine = self.state_machine
         machine.fault_present = self._inputs.torque_is_off or self._undervoltage
         powered = machine.powered or machine.state is PdsState.FAULT_REACTION_ACTIVE
@@ -320,7 +320,7 @@ class PowerDriveSystem:
         self._dc_link_voltage.value = round(1000.0 * volts)
 
     def _show_status(self) -> None:
-        # Whatever changes here, the drive looks anew whether `steady.take` may go on.
+        # What changes here may end steady operation: the drive decides anew.
         self._state.steady = False
         machine = self.state_machine
         status: int = machine.state.value
@@ -344,9 +344,9 @@ class PowerDriveSystem:
 def _supported_modes(dictionary: Dictionary) -> list[int]:
     """Return the modes that the dictionary has, of those that are served.
 
-    They are those of 0x6502. Some vendors leave its value or its torque bits out: then there is
-    cyclic synchronous torque, as the target torque is there, profile torque if the slope is, and
-    without a value homing if its method is.
+    They are those of 0x6502. Some vendors leave its value or its torque bits out: then they are
+    cyclic synchronous torque, profile torque if there is a slope (0x6087), and, without a value,
+    homing if there is a method (0x6098).
     """
     said = dictionary.number(0x6502, absent=0).value
     modes = [mode for mode in (PROFILE_TORQUE, CYCLIC_SYNCHRONOUS_TORQUE) if said & _bit(mode)]

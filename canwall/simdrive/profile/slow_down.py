@@ -1,11 +1,11 @@
 """Slowing down: the drive's own velocity controller brings the motion to a standstill.
 
-In the torque modes the master gives the torque, so when it is to stop the drive has to brake by
-itself: Nanotec's and ESTUN's manuals have the axis decelerate until its velocity is 0 in profile
-torque mode as well (statusword bit 10 in halt), Lenze's i950 brakes its quick stop in cyclic
-synchronous torque with 0x6072 and 0x6073 as its limits and without 0x60E0 and 0x60E1, Elmo's
-Maestro brakes at the current limit in torque mode. So a ramp here is one of the velocity. A
-dictionary that has no deceleration (0x6084, 0x6085), or zero, leaves the motor free.
+In the torque modes the master gives the torque, so to stop the drive has to brake by itself:
+Nanotec's and ESTUN's manuals have the axis decelerate until its velocity is 0 in profile torque
+mode as well (statusword bit 10 in halt), Lenze's i950 brakes its quick stop in cyclic synchronous
+torque with 0x6072 and 0x6073 as its limits and without 0x60E0 and 0x60E1, Elmo's Maestro brakes at
+the current limit in torque mode. So a ramp here is one of the velocity. A dictionary that has no
+deceleration (0x6084, 0x6085), or zero, leaves the motor free.
 """
 
 import math
@@ -16,14 +16,14 @@ from canwall.simdrive.profile.hardware import Hardware
 from canwall.simdrive.profile.option_codes import Ramp
 
 STANDSTILL_RAD_S = 2.0 * math.pi / 60.0
-"""Below one revolution per minute the axis counts as standing."""
+"""Standstill: less than one revolution per minute."""
 
 _GIVES_UP_S = 5.0
-# Whoever turns the axis against the limits of the drive must not keep it in its slow-down for
-# ever: Beckhoff's AX2000, for one, disables after 5 s (STOPMODE).
+# A load beyond the limits of the drive must not keep it in its slow-down for ever: Beckhoff's
+# AX2000, for one, disables after 5 s (STOPMODE).
 
 _GAIN = 0.5
-"""Part of a velocity error that is made good within one period."""
+"""Part of a velocity error that is corrected within one period."""
 
 _RESET_PERIODS = 20.0
 """Integral action time of the velocity controller, in periods."""
@@ -53,17 +53,17 @@ class SlowDown:
         self._period_s = period_s
         self._free = True
         self.begun = False
-        """Whether the controller has given a torque."""
+        """True once the controller has demanded a torque."""
         self._rate = 0.0
         self._reference = 0.0
         self._integral = 0.0
         self._standing_s = 0.0
         self.done = True
-        """Whether the axis has come to rest, or nothing is to be waited for."""
+        """True if the axis has come to rest, or is not waited for."""
 
     @property
     def braking(self) -> bool:
-        """Whether there is a torque that slows the axis down."""
+        """True if a torque slows the axis down."""
         return not self._free
 
     def begin(self, ramp: Ramp) -> None:

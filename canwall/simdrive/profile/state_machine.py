@@ -22,7 +22,7 @@ class PdsState(Enum):
 
 
 class Command(Enum):
-    """What a controlword asks for (CiA 402-2, table of commands); fault reset is an edge."""
+    """Commands of the controlword (CiA 402-2, table of commands); fault reset is an edge."""
 
     DISABLE_VOLTAGE = 0
     QUICK_STOP = 1
@@ -64,20 +64,20 @@ _TRANSITIONS = {
 
 
 def decode(controlword: int) -> Command | None:
-    """Return the command in bits 0 to 3 and 7, None if nothing is to be done."""
+    """Return the command in bits 0 to 3 and 7; None: there is none."""
     if not controlword & 0x02:
         return Command.DISABLE_VOLTAGE
     if not controlword & 0x04:
         return Command.QUICK_STOP
     if controlword & FAULT_RESET:
-        return None  # the standard wants bit 7 clear; only what stops is obeyed regardless
+        return None  # the standard wants bit 7 clear; only commands that stop are obeyed regardless
     if not controlword & 0x01:
         return Command.SHUTDOWN
     return Command.ENABLE_OPERATION if controlword & 0x08 else Command.SWITCH_ON
 
 
 class StateMachine:
-    """Takes controlwords and faults; tells its owner of every change.
+    """Takes controlwords and faults; calls its owner after every change.
 
     A transition that ends the operation waits for the slow-down that its option code asks for
     (``ramp``); its owner carries that out and says when the drive is at rest.
@@ -94,18 +94,18 @@ class StateMachine:
         Args:
             dictionary: has the option codes.
             changed: called after each change of the state or of the ramp.
-            at_rest: whether the slow-down under way is done.
+            at_rest: returns True if the slow-down in progress is done.
 
         Raises:
-            DictionaryError: an option code is of no use.
+            DictionaryError: an option code is not an integer, or its value is not served.
         """
         self.state = PdsState.NOT_READY_TO_SWITCH_ON
         self.ramp: Ramp | None = None
-        """How the drive is to slow down, None: it is not to."""
+        """Way to slow down; None: the drive does not have to."""
         self.voltage = True
-        """Whether the DC link is up: without, nothing is switched on (transition 3)."""
+        """True if the DC link is up: otherwise transition 3 is not possible."""
         self.fault_present = False
-        """Whether what led to the fault is still there: it cannot be reset (transition 15)."""
+        """True while the cause of a fault persists: transition 15 is not possible."""
         self._changed = changed
         self._at_rest = at_rest
         self._following: PdsState | None = None
@@ -119,21 +119,21 @@ class StateMachine:
 
     @property
     def powered(self) -> bool:
-        """Whether the drive function is on: a lost connection matters (0x6007)."""
+        """True if the drive function is on: a lost connection has an effect (0x6007)."""
         return self.state in (PdsState.OPERATION_ENABLED, PdsState.QUICK_STOP_ACTIVE)
 
     @property
     def faulty(self) -> bool:
-        """Whether the drive is in FAULT, or about to be."""
+        """True if the drive is in FAULT, or on its way there."""
         return self.state in (PdsState.FAULT_REACTION_ACTIVE, PdsState.FAULT)
 
     @property
     def stays(self) -> bool:
-        """Whether the drive is to stay in QUICK STOP ACTIVE (0x605A = 5 to 7)."""
+        """True if the drive stays in QUICK STOP ACTIVE (0x605A = 5 to 7)."""
         return self.state is PdsState.QUICK_STOP_ACTIVE and self._following is None
 
     def reset(self) -> None:
-        """Transition 0: power-on or reset of the node."""
+        """Take transition 0: power-on or reset of the node."""
         self._last_controlword = 0
         self._enter(PdsState.NOT_READY_TO_SWITCH_ON)
 
@@ -159,7 +159,7 @@ class StateMachine:
             self._enter(target)
 
     def _ready_for(self, target: PdsState) -> bool:
-        """Whether a transition that switches something on may be taken."""
+        """Return True if a transition that switches something on is possible."""
         if self.state is PdsState.READY_TO_SWITCH_ON and target is not PdsState.SWITCH_ON_DISABLED:
             return self.voltage  # 3
         if self.state is PdsState.QUICK_STOP_ACTIVE and target is PdsState.OPERATION_ENABLED:
@@ -182,7 +182,7 @@ class StateMachine:
             self._enter(target)
 
     def fault(self, *, coasting: bool = False) -> None:
-        """Transition 13, from every state; what 0x605E = 0 or nothing to brake ends in FAULT.
+        """Take transition 13, and 14 where 0x605E = 0 or there is nothing to brake.
 
         Args:
             coasting: there is no torque to brake with.
@@ -198,7 +198,7 @@ class StateMachine:
             self._enter(PdsState.FAULT_REACTION_ACTIVE, ramp, PdsState.FAULT)
 
     def step(self) -> None:
-        """Take the automatic transition that is due: what the drive had to do is done."""
+        """Take the automatic transition that is due."""
         if self.state is PdsState.NOT_READY_TO_SWITCH_ON:
             self._enter(PdsState.SWITCH_ON_DISABLED)  # 1
         elif self._following is not None and self._at_rest():

@@ -1,4 +1,4 @@
-"""From the torque that is wanted to the one that the motor gives: limits, units, display."""
+"""From target torque to motor torque: limits, units, display."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,7 +103,7 @@ class TorquePath:
 
     @property
     def limited(self) -> bool:
-        """True if the motor has less than was wanted."""
+        """True if a limit reduces the torque."""
         return bool(self._state.limited)
 
     @property
@@ -119,7 +119,7 @@ class TorquePath:
         return largest
 
     def off(self) -> None:
-        """Take the torque away at once."""
+        """Demand no torque from now on."""
         self._show(0)
         self._state.limited = False
 
@@ -129,14 +129,14 @@ class TorquePath:
         self._state.held = self._demand.value
 
     def give(self, wanted: int) -> None:
-        """Demand the torque wanted from now on, within all limits."""
+        """Demand a torque from now on, within all limits."""
         actual = limited(self._record, self._state.used, wanted)
         self._state.held = actual
         self._show(actual)
         self._state.limited = actual != wanted
 
     def brake(self, torque_nm: float) -> None:
-        """Demand a torque that is within ``largest_nm``; no other limit keeps a brake away."""
+        """Demand a torque that is within ``largest_nm``; no other limit holds for a brake."""
         scale = nm_per_mille(self._record)
         self._state.held = round(torque_nm / scale) if scale else 0
         self._show(self._state.held)
