@@ -131,7 +131,7 @@ def test_an_interrupted_sweep_goes_on(tmp_path: Path) -> None:
     with pytest.raises(StoppedError):
         sweep(plan, output, workers=1, progress=stop_after(2))
     assert not output.exists()
-    with pytest.raises(InputError, match="holds an unfinished sweep; --resume goes on"):
+    with pytest.raises(InputError, match="holds an unfinished sweep; --resume continues"):
         sweep(plan, output)
     other = plan_of(stiffness="1:100:41", operator=["none", "finger", "grip", "hand"])
     with pytest.raises(InputError, match="another configuration or other axes"):
