@@ -10,14 +10,13 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field
 
-from canwall.bench.budget import USABLE, BudgetFrame, bus_budget
+from canwall.bench.budget import USABLE, cycle_budget
 from canwall.bench.latency import measurement_settings
 from canwall.config import Settings
 from canwall.cycle import Exchange, Loop, WallAxis, WallGivenUpError, run_laws
 from canwall.drive import DriveError, DriveNode, DriveSetup, Link, PdoLayout, disable, set_up
 from canwall.drive import objects as od
 from canwall.drive.cia402 import DriveState, state_of, status_text
-from canwall.drive.pdo import tpdos_on_sync
 from canwall.eds import load_eds
 from canwall.errors import RunFailedError
 from canwall.record import Ring
@@ -119,15 +118,8 @@ def _describe(setup: DriveSetup, settings: Settings, findings: Findings) -> None
 def _describe_budget(
     node: DriveNode, setup: DriveSetup, settings: Settings, findings: Findings
 ) -> None:
-    """All that the drive sends with a SYNC, whether the wall needs it or not."""
-    bus, counted = settings.bus, 1 if setup.sync_counter_overflow else 0
-    budget = bus_budget(
-        BudgetFrame("SYNC", setup.sync_cob_id, counted),
-        [BudgetFrame("TPDO", tpdo.cob_id, tpdo.length) for tpdo in tpdos_on_sync(node)],
-        [BudgetFrame("RPDO", setup.rpdo.cob_id, setup.rpdo.length)],
-        bus.bitrate,
-        bus.cycle_s,
-    )
+    """Describe the budget of all that the drive sends with a SYNC, needed or not."""
+    bus, budget = settings.bus, cycle_budget(node, setup, settings.bus)
     for line in budget.lines:
         frame = line.frame
         over = f"{line.earliest_s * 1e6:.0f} to {line.latest_s * 1e6:.0f} µs"

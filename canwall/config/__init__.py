@@ -7,7 +7,7 @@ Every key has its unit in its name. An unknown key, a wrong type or an impossibl
 from canwall.config.drive import Drive
 from canwall.config.fault import Fault
 from canwall.config.hand import Hand, Move, RandomStrikes
-from canwall.config.reading import absolute_law, first_error, load, overridden, shipped
+from canwall.config.reading import absolute_law, first_error, load, shipped, with_overrides
 from canwall.config.settings import (
     Bus,
     Estimator,
@@ -44,6 +44,6 @@ __all__ = [
     "absolute_law",
     "first_error",
     "load",
-    "overridden",
     "shipped",
+    "with_overrides",
 ]

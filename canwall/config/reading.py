@@ -80,7 +80,7 @@ def load(path: Path, overrides: Mapping[str, Any] | None = None) -> Settings:
     return _with_absolute_paths(settings, path.parent)
 
 
-def overridden(settings: Settings, values: Mapping[str, Any]) -> Settings:
+def with_overrides(settings: Settings, values: Mapping[str, Any]) -> Settings:
     """Return the settings with other values by dotted key, validated again. Raises ConfigError."""
     raw = settings.model_dump()
     for dotted, value in values.items():

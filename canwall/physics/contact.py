@@ -20,7 +20,7 @@ from canwall.physics.motion import (
 from canwall.physics.smooth import (
     EventFunction,
     Force,
-    Smooth,
+    SmoothMotion,
     deviation,
     event_value,
     first_sign_change,
@@ -60,7 +60,7 @@ _SHORTEST_FLIGHT = 2.0**-20
 
 
 @compiled
-def _time_to_close(handle: Smooth, hand: Smooth, side: float, span: float) -> float:
+def _time_to_close(handle: SmoothMotion, hand: SmoothMotion, side: float, span: float) -> float:
     """Return the first time in (0, span] at which the gap closes, else inf.
 
     A step is no longer than the largest relative acceleration would need to close the gap, so no
@@ -141,7 +141,7 @@ def _move_together(
 
 
 @compiled
-def _impact(handle: Smooth, hand: Smooth, t: float) -> Grasp:
+def _impact(handle: SmoothMotion, hand: SmoothMotion, t: float) -> Grasp:
     """Return both as one after the impact at time t."""
     y, v = state_at(handle, t)
     _, hand_v = state_at(hand, t)
@@ -158,7 +158,7 @@ def _move_apart(
     piece, _ = linear_piece(handle, y, v, motor.constant)
     stuck, motion, direction = motion_from(handle, piece, y, v, motor, remaining)
     span = min(remaining, quarter_period(hand.mass, hand.spring))
-    flight = Smooth(
+    flight = SmoothMotion(
         hand.mass,
         hand.viscous,
         hand.spring,
@@ -170,7 +170,7 @@ def _move_apart(
         0.0,
     )
     if stuck > 0.0:
-        still = Smooth(handle.mass, 0.0, 0.0, y, 0.0, 0.0, 0.0, 0.0, 0.0)
+        still = SmoothMotion(handle.mass, 0.0, 0.0, y, 0.0, 0.0, 0.0, 0.0, 0.0)
         wait = min(stuck, span)
         closing = _time_to_close(still, flight, hand.side, wait)
         if closing <= wait:
@@ -179,7 +179,7 @@ def _move_apart(
         if stuck >= span:
             return wait, Grasp(y, 0.0, hand_y, hand_v, False)
         script = shifted(script, stuck)
-        flight = Smooth(
+        flight = SmoothMotion(
             hand.mass,
             hand.viscous,
             hand.spring,

@@ -22,7 +22,7 @@ from canwall.physics.smooth import (
     VELOCITY,
     EventFunction,
     Force,
-    Smooth,
+    SmoothMotion,
     find_root,
     first_sign_change,
     shifted,
@@ -180,7 +180,7 @@ def _time_to_break_loose(
         return max(coulomb - direction * pull, 0.0) / abs(force.slope), direction
     # The acceleration of a free unit mass is the force, so the remaining friction is an event
     # function of its motion.
-    free = Smooth(1.0, 0.0, 0.0, 0.0, 0.0, pull, force.slope, force.excess, force.rate)
+    free = SmoothMotion(1.0, 0.0, 0.0, 0.0, 0.0, pull, force.slope, force.excess, force.rate)
     up = first_sign_change(free, EventFunction(coulomb, 0.0, 0.0, 0.0, -1.0), 1.0, horizon)
     down = first_sign_change(free, EventFunction(coulomb, 0.0, 0.0, 0.0, 1.0), 1.0, horizon)
     return (up, 1.0) if up <= down else (down, -1.0)
@@ -189,7 +189,7 @@ def _time_to_break_loose(
 @compiled
 def motion_from(
     plant: Record, piece: Piece, y: float, v: float, force: Force, horizon: float
-) -> tuple[float, Smooth, float]:
+) -> tuple[float, SmoothMotion, float]:
     """Return the motion from a state on: (time for which it sticks, motion after it, direction).
 
     The time is at least `horizon` if the handle sticks that long.
@@ -214,7 +214,7 @@ def motion_from(
             # Friction and spring balance exactly here; recomputed from the force, the acceleration
             # could have the wrong sign by rounding and end the slip at once.
             constant = spring * y
-    motion = Smooth(
+    motion = SmoothMotion(
         plant.mass,
         piece.viscous,
         spring,
@@ -229,7 +229,9 @@ def motion_from(
 
 
 @compiled
-def _reversal(motion: Smooth, direction: float, span: float, y_end: float, v_end: float) -> float:
+def _reversal(
+    motion: SmoothMotion, direction: float, span: float, y_end: float, v_end: float
+) -> float:
     """Return the first time in (0, span] at which the velocity reverses, else span.
 
     span is at most a quarter period, (y_end, v_end) the state at its end.
@@ -261,7 +263,7 @@ def quarter_period(mass: float, spring: float) -> float:
 
 @compiled
 def move_to_event(
-    piece: Piece, motion: Smooth, direction: float, horizon: float
+    piece: Piece, motion: SmoothMotion, direction: float, horizon: float
 ) -> tuple[float, float, float]:
     """Move to the next event, no further than `horizon`: (duration, y, ẏ).
 
@@ -354,7 +356,7 @@ def time_to_wall(plant: Record, y: float, v: float, u: float, duration: float) -
 
     Under the constant force u and without friction; the sign change guarantees a crossing.
     """
-    motion = Smooth(plant.mass, plant.viscous, plant.spring, y, v, u, 0.0, 0.0, 0.0)
+    motion = SmoothMotion(plant.mass, plant.viscous, plant.spring, y, v, u, 0.0, 0.0, 0.0)
     return find_root(motion, EventFunction(0.0, 0.0, 1.0, 0.0, 0.0), 0, 0.0, duration, False)
 
 

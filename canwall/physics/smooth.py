@@ -31,7 +31,7 @@ class Force(NamedTuple):
     rate: float
 
 
-class Smooth(NamedTuple):
+class SmoothMotion(NamedTuple):
     """Motion mass·ÿ + viscous·ẏ + spring·y = F(t) from (y, v), F as in `Force`, spring of any sign.
 
     Forces that are constant between two events, such as friction, are part of `constant`.
@@ -73,7 +73,7 @@ def shifted(force: Force, t: float) -> Force:
 
 
 @compiled
-def _lagged_state(motion: Smooth, t: float) -> tuple[float, float]:
+def _lagged_state(motion: SmoothMotion, t: float) -> tuple[float, float]:
     m = motion
     kappa = m.spring / m.mass
     h1, h0, g1, g2, r1, r0 = lag_response(m.viscous / m.mass, kappa, m.rate, t)
@@ -87,7 +87,7 @@ def _lagged_state(motion: Smooth, t: float) -> tuple[float, float]:
 
 
 @compiled
-def state_at(motion: Smooth, t: float) -> tuple[float, float]:
+def state_at(motion: SmoothMotion, t: float) -> tuple[float, float]:
     """Return (y, ẏ) at time t."""
     m = motion
     if m.excess == 0.0:
@@ -96,7 +96,7 @@ def state_at(motion: Smooth, t: float) -> tuple[float, float]:
 
 
 @compiled
-def deviation(motion: Smooth, t: float) -> tuple[float, float]:
+def deviation(motion: SmoothMotion, t: float) -> tuple[float, float]:
     """Return (y − y(0) − ẏ(0)·t, ẏ − ẏ(0)) at time t, without cancellation for small t."""
     m = motion
     _, h0, g1, g2, r1, r0 = lag_response(m.viscous / m.mass, m.spring / m.mass, m.rate, t)
@@ -107,7 +107,7 @@ def deviation(motion: Smooth, t: float) -> tuple[float, float]:
 
 
 @compiled
-def largest_acceleration(motion: Smooth, span: float) -> float:
+def largest_acceleration(motion: SmoothMotion, span: float) -> float:
     """Return a bound of |ÿ| over [0, span].
 
     ÿ = ÿ(0)·h' + (slope − spring·ẏ(0))/m·h + the lag's part, with |h'| ≤ 1 for an oscillator and
@@ -123,7 +123,9 @@ def largest_acceleration(motion: Smooth, span: float) -> float:
 
 
 @compiled
-def event_value(motion: Smooth, event: EventFunction, order: int, t: float) -> tuple[float, float]:
+def event_value(
+    motion: SmoothMotion, event: EventFunction, order: int, t: float
+) -> tuple[float, float]:
     """Return the derivative of an event function of this order, and its slope, at time t.
 
     Order 3 stands for (D + rate)·D², which turns any event function into a damped oscillation.
@@ -160,7 +162,7 @@ def event_value(motion: Smooth, event: EventFunction, order: int, t: float) -> t
 
 @compiled
 def find_root(
-    motion: Smooth, event: EventFunction, order: int, low: float, high: float, rising: bool
+    motion: SmoothMotion, event: EventFunction, order: int, low: float, high: float, rising: bool
 ) -> float:
     """Return the root of an event function in (low, high], by Newton's method in a bracket."""
     rounding = 4e-16 * high
@@ -184,7 +186,9 @@ def find_root(
 
 
 @compiled
-def first_sign_change(motion: Smooth, event: EventFunction, sign: float, span: float) -> float:
+def first_sign_change(
+    motion: SmoothMotion, event: EventFunction, sign: float, span: float
+) -> float:
     """Return the first time in (0, span] at which an event function changes its sign, else inf.
 
     `sign` is its sign at the start; span is at most a quarter period of the oscillator.

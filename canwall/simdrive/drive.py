@@ -29,7 +29,7 @@ from canwall.simdrive.mechanics.actuator import Actuator
 from canwall.simdrive.mechanics.motion import RecordedMotion
 from canwall.simdrive.profile.hardware import Hardware
 from canwall.simdrive.profile.power_drive_system import Motion, PowerDriveSystem
-from canwall.simdrive.state import DriveState
+from canwall.simdrive.state import DriveRecord
 from canwall.simdrive.steady import DECLINED, take
 
 Receive: TypeAlias = Callable[[bytes], None]
@@ -93,7 +93,7 @@ class SimulatedDrive:
             raise ValueError(f"SYNC period {sync_period_s} s is not positive")
         if not torque_delay_cycles >= 0.0:
             raise ValueError(f"torque delay of {torque_delay_cycles} cycles is negative")
-        self.state = DriveState()
+        self.state = DriveRecord()
         """All that a cycle reads and writes."""
         self._record, self._fields = self.state.record, self.state.fields
         self._fields.period = sync_period_s

@@ -1,6 +1,6 @@
 """State of a drive from cycle to cycle: one record that Python and compiled code both work on.
 
-Services in Python read and write its fields as attributes (`DriveState.fields`), compiled functions
+Services in Python read and write its fields as attributes (`DriveRecord.fields`), compiled functions
 take the record itself. What stands in it stands nowhere else.
 """
 
@@ -123,7 +123,7 @@ DRIVE = np.dtype(
 )
 
 
-class DriveState:
+class DriveRecord:
     """The record of one drive, shape (1,), dtype DRIVE, and its fields as attributes."""
 
     def __init__(self) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from canwall.config import ConfigError, Settings, overridden
+from canwall.config import ConfigError, Settings, with_overrides
 from canwall.cycle import with_law
 from canwall.errors import InputError
 from canwall.run.closed_loop import cached_servo_scales, loop_delay
@@ -150,7 +150,7 @@ def _check(name: str, value: Value) -> None:
         raise InputError(f"sweep axis counts: has to be a whole number, not {value!r}")
 
 
-def resolve(base: Settings, point: Point) -> Settings:
+def settings_at(base: Settings, point: Point) -> Settings:
     """Return the settings of one strike: those of `base`, changed as the point says.
 
     The axes of the wall, stiffness and damping, are not applied. Raises ConfigError.
@@ -163,14 +163,14 @@ def resolve(base: Settings, point: Point) -> Settings:
         if name in values:
             settings = change(settings, values[name])
     keys = {k: v for k, v in values.items() if k not in NAMED}
-    settings = _overridden(settings, {k: v for k, v in keys.items() if not _of_the_model(k)})
+    settings = _with_keys(settings, {k: v for k, v in keys.items() if not _of_the_model(k)})
     assert settings.simulation is not None
     if values["servo"] == "ideal":
         ideal = settings.simulation.with_ideal_servo()
         settings = settings.model_copy(update={"simulation": ideal})
     model = law_model(settings, str(values["model"]), float(values["model_error"]))
     settings = settings.model_copy(update={"mechanics": model})
-    settings = _overridden(settings, {k: v for k, v in keys.items() if _of_the_model(k)})
+    settings = _with_keys(settings, {k: v for k, v in keys.items() if _of_the_model(k)})
     if settings.estimator.delay_cycles is None:
         known = {"delay_cycles": loop_delay(settings), "measure_delay": False}
         settings = settings.model_copy(
@@ -184,17 +184,17 @@ def _of_the_model(key: str) -> bool:
     return key.startswith("mechanics.")
 
 
-def _overridden(settings: Settings, keys: Mapping[str, Any]) -> Settings:
+def _with_keys(settings: Settings, keys: Mapping[str, Any]) -> Settings:
     if not keys:
         return settings
     try:
-        return overridden(settings, keys)
+        return with_overrides(settings, keys)
     except ConfigError as error:
         raise ConfigError(f"sweep axis {error}") from None
 
 
 def _with_rate(settings: Settings, rate: Value) -> Settings:
-    return _overridden(settings, {"bus.cycle_s": 1.0 / float(rate)})
+    return _with_keys(settings, {"bus.cycle_s": 1.0 / float(rate)})
 
 
 def _with_delay(settings: Settings, delay: Value) -> Settings:
@@ -203,7 +203,7 @@ def _with_delay(settings: Settings, delay: Value) -> Settings:
     The laws reckon with the same D.
     """
     synchronous = float(delay) >= 1.0
-    return _overridden(
+    return _with_keys(
         settings,
         {
             "drive.torque_pdo": "sync" if synchronous else "immediate",
@@ -240,7 +240,7 @@ def _with_torque_step(settings: Settings, step: Value) -> Settings:
 
 
 def _with_operator(settings: Settings, name: Value) -> Settings:
-    return overridden(settings, OPERATORS[str(name)].keys)
+    return with_overrides(settings, OPERATORS[str(name)].keys)
 
 
 #: In the order in which they are applied, before any key of the configuration.

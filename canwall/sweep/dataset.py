@@ -70,7 +70,7 @@ def assemble_dataset(plan: Plan, pieces: Mapping[int, NDArray[np.void]]) -> xr.D
     walls = len(plan.damping.values) if searched else len(plan.walls)
     table = np.zeros((len(plan.points), walls, len(plan.strikes)), plan.dtype)
     for number in range(plan.pieces):
-        condition, strikes, chosen = plan.where(number)
+        condition, strikes, chosen = plan.slices(number)
         found = pieces[number].reshape(strikes.stop - strikes.start, -1)
         table[condition, chosen, strikes] = found.T
     table = table.reshape(plan.shape)

@@ -23,7 +23,7 @@ from canwall.sweep.axes import (
     SweepAxis,
     Value,
     parse_axis,
-    resolve,
+    settings_at,
 )
 from canwall.sweep.strike import PreparedStrike
 
@@ -108,7 +108,7 @@ class Plan:
             return len(self.points) * len(self.damping.values)
         return len(self.points) * len(self.strikes) * self._per_strike
 
-    def where(self, piece: int) -> tuple[int, slice, slice]:
+    def slices(self, piece: int) -> tuple[int, slice, slice]:
         """Return what a piece computes: condition, strikes, and walls (dampings in a search)."""
         if self.stiffness is None:
             condition, damping = divmod(piece, len(self.damping.values))
@@ -120,7 +120,7 @@ class Plan:
 
     def settings(self, point: Mapping[str, Value], strike: Mapping[str, Value]) -> Settings:
         """Return the settings of one strike. Raises ConfigError."""
-        return resolve(self.base, {**point, **strike})
+        return settings_at(self.base, {**point, **strike})
 
 
 def make_plan(base: Settings, given: Mapping[str, object], through: str = "sim") -> Plan:
@@ -183,7 +183,7 @@ def _check_values(plan: Plan) -> None:
 
 def compute_piece(plan: Plan, piece: int) -> NDArray[np.void]:
     """Compute a piece of work; shape (strikes, walls), dtype of the plan."""
-    condition, strikes, walls = plan.where(piece)
+    condition, strikes, walls = plan.slices(piece)
     point = plan.points[condition]
     prepared = [
         PreparedStrike(plan.settings(point, s), plan.through) for s in plan.strikes[strikes]

@@ -8,7 +8,7 @@ from rig import eds_without
 
 from canwall.simdrive.communication.dictionary import Dictionary
 from canwall.simdrive.profile.position_unit import PositionUnit
-from canwall.simdrive.state import DriveState
+from canwall.simdrive.state import DriveRecord
 
 PAIR = """[{index:X}]
 ParameterName=x
@@ -63,14 +63,14 @@ def dictionary(path: Path, si_unit: int, **pairs: tuple[int, int]) -> Dictionary
 def test_units_per_increment(
     tmp_path: Path, si_unit: int, factors: dict[str, tuple[int, int]], per_increment: float
 ) -> None:
-    unit = PositionUnit(dictionary(tmp_path / "x.eds", si_unit, **factors), DriveState())
+    unit = PositionUnit(dictionary(tmp_path / "x.eds", si_unit, **factors), DriveRecord())
     unit.refresh()
     assert unit.per_increment == pytest.approx(per_increment)
 
 
 def test_a_write_takes_effect_at_once(tmp_path: Path) -> None:
     entries = dictionary(tmp_path / "x.eds", 0xFF410000, x608F=(4096, 1))
-    unit = PositionUnit(entries, DriveState())
+    unit = PositionUnit(entries, DriveRecord())
     unit.refresh()
     entries[0x60A8, 0].write(0x00B50000)
     assert unit.per_increment == 1.0

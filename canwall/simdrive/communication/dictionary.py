@@ -10,7 +10,7 @@ from canopen.objectdictionary import ODVariable, datatypes
 
 from canwall.eds import DictionaryError, load_eds
 from canwall.simdrive.communication.abort import AbortCode, AccessError
-from canwall.simdrive.state import OBJECTS, DriveState
+from canwall.simdrive.state import OBJECTS, DriveRecord
 
 MANDATORY = {
     0x1000: ("device type", datatypes.UNSIGNED32),
@@ -217,7 +217,7 @@ class Dictionary:
         self.node_id = node_id
         self._entries: dict[Key, Entry] = {}
         self._supplied: dict[Key, int] = {}
-        self._state: DriveState | None = None
+        self._state: DriveRecord | None = None
         self.dummies: dict[int, int] = {}
         """Sizes in bytes of the data types that an RPDO may map to skip bytes ([DummyUsage])."""
         for variable in variables:
@@ -336,7 +336,7 @@ class Dictionary:
             raise self.error(index, subindex, "not an integer")
         return entry
 
-    def keep_in(self, state: DriveState) -> None:
+    def keep_in(self, state: DriveRecord) -> None:
         """Let the values of `state.OBJECTS` stand in a drive's record from now on.
 
         Raises:

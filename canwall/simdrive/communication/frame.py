@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import TypeAlias
 
 from canwall.frame import ERROR_FRAME, Frame
-from canwall.simdrive.state import DriveState
+from canwall.simdrive.state import DriveRecord
 
 __all__ = ["ERROR_FRAME", "NS_PER_100_US", "NS_PER_MS", "NS_PER_US", "Clock", "Frame", "Send"]
 
@@ -19,7 +19,7 @@ NS_PER_100_US = 100_000
 class Clock:
     """Protocol time in whole nanoseconds, so that sums of ticks stay exact."""
 
-    def __init__(self, state: DriveState) -> None:
+    def __init__(self, state: DriveRecord) -> None:
         """Begin at zero."""
         self._state = state.fields
         self._state.now_ns = self._state.ticked_ns = 0

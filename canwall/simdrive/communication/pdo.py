@@ -15,7 +15,7 @@ from canwall.simdrive.communication.cob_id import (
     check_unchanged_while_valid,
 )
 from canwall.simdrive.communication.dictionary import Dictionary, Entry, StateEntry
-from canwall.simdrive.state import DriveState
+from canwall.simdrive.state import DriveRecord
 
 CYCLIC = range(1, 241)
 ACYCLIC = 0
@@ -41,7 +41,7 @@ class Pdo:
         self,
         dictionary: Dictionary,
         index: int,
-        state: DriveState,
+        state: DriveRecord,
         changed: Callable[[], None],
     ) -> None:
         """Serve one pair of objects.

@@ -11,7 +11,7 @@ from canwall.simdrive.communication.dictionary import Dictionary, Key
 from canwall.simdrive.communication.emcy import PDO_TOO_SHORT, RPDO_TIMEOUT, EmergencyProducer
 from canwall.simdrive.communication.frame import NS_PER_MS
 from canwall.simdrive.communication.pdo import MAPPING_OFFSET, MAX_BYTES, Pdo
-from canwall.simdrive.state import NEVER, DriveState
+from canwall.simdrive.state import NEVER, DriveRecord
 
 _EVENT_TIMER = 5
 
@@ -49,7 +49,7 @@ class Rpdo(Pdo):
         self,
         dictionary: Dictionary,
         index: int,
-        state: DriveState,
+        state: DriveRecord,
         emcy: EmergencyProducer,
         changed: Callable[[], None],
         timed_out: Callable[[int, Key], None],

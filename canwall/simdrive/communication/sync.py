@@ -12,7 +12,7 @@ from canwall.simdrive.communication.cob_id import BIT_30, CAN_ID, NOT_VALID, che
 from canwall.simdrive.communication.dictionary import Dictionary, Key
 from canwall.simdrive.communication.emcy import SYNC_LENGTH, SYNC_LOST, EmergencyProducer
 from canwall.simdrive.communication.frame import NS_PER_US
-from canwall.simdrive.state import NEVER, DriveState
+from canwall.simdrive.state import NEVER, DriveRecord
 
 _COUNTER_OVERFLOW: Key = (0x1019, 0)
 _CYCLE_PERIOD: Key = (0x1006, 0)
@@ -40,7 +40,7 @@ class SyncConsumer:
     def __init__(
         self,
         dictionary: Dictionary,
-        state: DriveState,
+        state: DriveRecord,
         emcy: EmergencyProducer,
         changed: Callable[[], None],
         lost: Callable[[int, Key], None],

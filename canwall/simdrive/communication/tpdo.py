@@ -10,7 +10,7 @@ from canwall.simdrive.communication.cob_id import BIT_30
 from canwall.simdrive.communication.dictionary import Dictionary
 from canwall.simdrive.communication.frame import NS_PER_100_US, NS_PER_MS, Send
 from canwall.simdrive.communication.pdo import CYCLIC, EVENT_DRIVEN, SYNCHRONOUS_REMOTE, Pdo
-from canwall.simdrive.state import CYCLIC_OBJECTS, DriveState
+from canwall.simdrive.state import CYCLIC_OBJECTS, DriveRecord
 
 _HIGHEST_COUNTER = 240
 
@@ -32,7 +32,7 @@ class Tpdo(Pdo):
         self,
         dictionary: Dictionary,
         index: int,
-        state: DriveState,
+        state: DriveRecord,
         send: Send,
         changed: Callable[[], None],
     ) -> None:

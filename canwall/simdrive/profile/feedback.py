@@ -11,7 +11,7 @@ from canwall.simdrive.communication.abort import AbortCode, AccessError
 from canwall.simdrive.communication.dictionary import Dictionary
 from canwall.simdrive.profile.hardware import Hardware
 from canwall.simdrive.profile.position_unit import PositionUnit
-from canwall.simdrive.state import POSITION, VELOCITY, DriveState, signed
+from canwall.simdrive.state import POSITION, VELOCITY, DriveRecord, signed
 
 _INT32 = 1 << 31
 
@@ -64,7 +64,7 @@ class Feedback:
     """Latches the measured values into 0x6064 and 0x606C."""
 
     def __init__(
-        self, dictionary: Dictionary, state: DriveState, hardware: Hardware, motion: Motion
+        self, dictionary: Dictionary, state: DriveRecord, hardware: Hardware, motion: Motion
     ) -> None:
         """Serve 0x6064, 0x606C, 0x607E, 0x60A9 and the factor group of the dictionary.
 

@@ -2,7 +2,7 @@
 
 from canwall.simdrive.communication.dictionary import Dictionary
 from canwall.simdrive.profile.hardware import Hardware
-from canwall.simdrive.state import DriveState
+from canwall.simdrive.state import DriveRecord
 
 NEGATIVE_LIMIT, POSITIVE_LIMIT, HOME, INTERLOCK = (1 << bit for bit in range(4))
 
@@ -13,7 +13,7 @@ class DigitalInputs:
     A limit switch stays closed beyond the position where it closes.
     """
 
-    def __init__(self, dictionary: Dictionary, state: DriveState, hardware: Hardware) -> None:
+    def __init__(self, dictionary: Dictionary, state: DriveRecord, hardware: Hardware) -> None:
         """Serve 0x60FD of the dictionary.
 
         Raises:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
-from canwall.simdrive.state import DriveState
+from canwall.simdrive.state import DriveRecord
 
 _RATED = 1000
 _WARNING = 0.8
@@ -43,7 +43,7 @@ def warns(drives: NDArray[np.void], used: float) -> bool:
 class Overload:
     """The budget of a motor."""
 
-    def __init__(self, state: DriveState, peak: float, overload_s: float) -> None:
+    def __init__(self, state: DriveRecord, peak: float, overload_s: float) -> None:
         """Begin cold; at the peak torque the budget lasts for ``overload_s``."""
         self._record, self._state = state.record, state.fields
         self._state.peak = peak

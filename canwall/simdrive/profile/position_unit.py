@@ -7,7 +7,7 @@ feed constant is 0x6092, or follows from a unit of angle in 0x60A8.
 import math
 
 from canwall.simdrive.communication.dictionary import Dictionary, Entry
-from canwall.simdrive.state import DriveState
+from canwall.simdrive.state import DriveRecord
 
 #: Codes of 0x60A8 in bits 16 to 23 (CiA 303-2): units per revolution. All others: increments.
 _ANGLES = {0x10: 2.0 * math.pi, 0x41: 360.0, 0xB4: 1.0}
@@ -37,7 +37,7 @@ def _pair(dictionary: Dictionary, index: int) -> tuple[Entry, Entry]:
 class PositionUnit:
     """Serves the factor group. A drive with an encoder of 1/1 shows increments."""
 
-    def __init__(self, dictionary: Dictionary, state: DriveState) -> None:
+    def __init__(self, dictionary: Dictionary, state: DriveRecord) -> None:
         """Serve the objects of the dictionary; begin with increments."""
         self._state = state.fields
         self._state.position_scale = 1.0

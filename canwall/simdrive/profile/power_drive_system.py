@@ -17,7 +17,7 @@ from canwall.simdrive.profile.option_codes import OptionCode, Ramp
 from canwall.simdrive.profile.slow_down import STANDSTILL_RAD_S, SlowDown
 from canwall.simdrive.profile.state_machine import Command, PdsState, StateMachine
 from canwall.simdrive.profile.torque import TorquePath
-from canwall.simdrive.state import DriveState
+from canwall.simdrive.state import DriveRecord
 
 __all__ = ["Motion", "PowerDriveSystem"]
 
@@ -50,7 +50,7 @@ class PowerDriveSystem:
     def __init__(
         self,
         dictionary: Dictionary,
-        state: DriveState,
+        state: DriveRecord,
         motion: Motion,
         emcy: EmergencyProducer,
         hardware: Hardware,

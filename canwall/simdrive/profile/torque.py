@@ -15,7 +15,7 @@ from canwall.simdrive.state import (
     RATED_TORQUE,
     TORQUE,
     TORQUE_DEMAND,
-    DriveState,
+    DriveRecord,
 )
 from canwall.simdrive.state import NEGATIVE_LIMIT as NEGATIVE_TORQUE_LIMIT
 from canwall.simdrive.state import POSITIVE_LIMIT as POSITIVE_TORQUE_LIMIT
@@ -78,7 +78,7 @@ class TorquePath:
     so 0x6073 and 0x6078 (per mille of 0x6075) are the same numbers.
     """
 
-    def __init__(self, dictionary: Dictionary, state: DriveState, hardware: Hardware) -> None:
+    def __init__(self, dictionary: Dictionary, state: DriveRecord, hardware: Hardware) -> None:
         """Serve 0x6072 to 0x6074, 0x6076 to 0x6078, 0x60E0 and 0x60E1 of the dictionary.
 
         Raises:
