@@ -1,7 +1,7 @@
 """State of a drive from cycle to cycle: one record that Python and compiled code both work on.
 
-Services in Python read and write its fields as attributes (`DriveRecord.fields`), compiled functions
-take the record itself. What stands in it stands nowhere else.
+Services in Python read and write its fields as attributes (`DriveRecord.fields`), compiled
+functions take the record itself. What stands in it stands nowhere else.
 """
 
 import numpy as np
