@@ -23,6 +23,7 @@ def said_by(popen: Popen, code: str, *words: str, **options: object) -> tuple[in
     return process.returncode, out, errors
 
 
+@pytest.mark.slow
 @FORKED
 def test_streams_arguments_folder_and_environment(popen: Popen, tmp_path: Path) -> None:
     code = "import os, sys; print(sys.argv, os.getcwd(), os.getenv('COLOUR'), input())"

@@ -24,6 +24,7 @@ def run(*arguments: object) -> int:
     return cli.guarded(lambda: cli.app([*map(str, arguments)], standalone_mode=False))
 
 
+@pytest.mark.slow
 def test_table_of_two_laws(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -65,7 +66,9 @@ def test_table_of_two_laws(
         (["--operator", "giant"], "sweep axis operator: has to be one of none, finger"),
         (["--through", "air"], "--through air: has to be sim or bus"),
         (["--workers", "2", "--dask", "nowhere"], "--workers and --dask: keep one"),
-        (["--dask", "nowhere"], "--dask nowhere: no scheduler there"),
+        pytest.param(
+            ["--dask", "nowhere"], "--dask nowhere: no scheduler there", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_options_without_a_meaning_for_the_table(

@@ -408,11 +408,11 @@ def test_record_that_is_lost(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) ->
     recorders: list[Recorder] = []
 
     class Lost(Recorder):
-        def __init__(self, *args: Any) -> None:
-            super().__init__(*args)
+        def __init__(self) -> None:
+            super().__init__()
             recorders.append(self)
 
-    monkeypatch.setattr(canwall.run.running, "Recorder", Lost)
+    monkeypatch.setattr("canwall.record.recorder.Recorder", Lost)
     settings = settings_with({"run.duration_s": 0.3})
     with pytest.raises(RunFailedError, match="the writer of the record did not finish"):
         canwall.run.run(

@@ -70,6 +70,7 @@ def test_linear_stability_with_delay(delay: int, share: float) -> None:
     np.testing.assert_array_equal(swings(dataset), [False, True])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", CEILINGS)
 def test_ceilings_without_damping_of_the_plant(delay: int) -> None:
     ceiling, damping = CEILINGS[delay]

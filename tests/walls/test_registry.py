@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 from law_bench import COMPENSATED, wall_of
-from numba import cfunc
 from numba.core.runtime import _nrt_python, rtsys
 
-from canwall.compiled import Record
+from canwall.compiled import Record, compiled_for_c
 from canwall.walls import (
     DEADBEAT,
     LAWS,
@@ -85,9 +84,9 @@ def test_a_law_is_compiled_once_when_it_is_first_used(monkeypatch: pytest.Monkey
 
     def counting(*args: Any, **kwargs: Any) -> Any:
         compiled.append(args)
-        return cfunc(*args, **kwargs)
+        return compiled_for_c(*args, **kwargs)
 
-    monkeypatch.setattr(interface, "cfunc", counting)
+    monkeypatch.setattr(interface, "compiled_for_c", counting)
 
     def constant(wall: Record) -> float:
         return 2.5
