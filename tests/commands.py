@@ -23,13 +23,14 @@ from canwall.record import read_signals
 
 PATIENCE_S = 60.0
 
-#: Changes of a shipped configuration, in real time. A machine that has other things to do is not to
-#: be why the run ends: TPDOs may be missing for long, and the torque that is held meanwhile throws
-#: no handle.
+#: Changes of config/unixcan.toml for a run in real time that does not end because the machine has
+#: other things to do: frames may be missing or late for long, and the torque that is held meanwhile
+#: throws no handle.
 ON_A_BUSY_MACHINE = {
     "cycle_s = 0.001": 'cycle_s = 0.004\npace = "real_time"',
+    "wait_s = 5.0": "wait_s = 20.0\nwatchdog_s = 0.5",
     "hold_cycles = 2": "hold_cycles = 100",
-    "ramp_cycles = 10": "ramp_cycles = 1000",
+    "ramp_cycles = 10": "ramp_cycles = 1000\nlate_cycles = 0",
     "stiffness_nm_per_rad = 50.0": "stiffness_nm_per_rad = 2.0",
 }
 

@@ -8,9 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import COMMAND, Start, command, config_file
-from rig import SIM_CONFIG, Loop, RigFactory, settings_with
+from commands import (
+    COMMAND,
+    ON_A_BUSY_MACHINE,
+    Start,
+    command,
+    config_file,
+    wait_for,
+)
+from rig import Loop, RigFactory, settings_with
 
+from canwall import config
 from canwall.config import ConfigError
 from canwall.errors import RunFailedError
 from canwall.record import Mailbox, RunFolder, read_signals
@@ -95,17 +103,16 @@ def test_change_is_in_force_from_the_cycle_that_it_is_told(
 
 @pytest.mark.slow
 def test_run_of_the_command_is_changed_by_the_command(start: Start, tmp_path: Path) -> None:
-    file = config_file(
-        tmp_path / "c.toml",
-        {'pace = "auto"': 'pace = "real_time"', "duration_s = 4.2": "# until Ctrl-C"},
-        SIM_CONFIG,
-    )
+    embedded = {
+        'interface = "unixcan"': 'interface = "virtual"',
+        'channel = "/tmp/canwall.sock"': 'channel = "canwall"',
+        "duration_s = 4.2": "# until Ctrl-C",
+    }
+    source = config.shipped("config/unixcan.toml")
+    file = config_file(tmp_path / "c.toml", ON_A_BUSY_MACHINE | embedded, source)
     folder = tmp_path / "run"
     run = start(COMMAND, "run", file, "--output", folder)
-    deadline = time.monotonic() + PATIENCE_S
-    while not (folder / "live.json").exists():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    wait_for((folder / "live.json").exists)
     done = command("change", folder, "stiffness_nm_per_rad=12.5")
     assert done.stderr == ""
     assert done.stdout.startswith("in force from cycle ")
@@ -114,7 +121,7 @@ def test_run_of_the_command_is_changed_by_the_command(start: Start, tmp_path: Pa
     assert run.wait(PATIENCE_S) == 130
     stiffness = read_signals(folder / "signals.parquet")["stiffness"].to_numpy()
     assert stiffness[cycle] == 12.5
-    assert stiffness[cycle - 1] == 50.0
+    assert stiffness[cycle - 1] == 2.0
 
 
 @pytest.mark.parametrize(

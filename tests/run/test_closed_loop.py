@@ -12,7 +12,7 @@ from canwall.record import ROW, TIMING_COLUMNS, Phase
 from canwall.run.closed_loop import ENABLING_CYCLES, simulate
 from canwall.walls import DEADBEAT, LAWS
 
-CYCLES = 10_000
+CYCLES = 4_000
 #: What the bus has besides: the state machine's words, and the clock.
 BESIDES = {"statusword", "controlword", "phase", *TIMING_COLUMNS}
 
@@ -21,7 +21,7 @@ def strikes(overrides: dict[str, Any]) -> Settings:
     """The hand of config/sim.toml strikes a wall that stays as it is."""
     settings = settings_with(overrides)
     assert settings.simulation is not None
-    hand = settings.simulation.hand.model_copy(update={"strikes": 10})
+    hand = settings.simulation.hand.model_copy(update={"strikes": 4})
     simulation = settings.simulation.model_copy(update={"hand": hand})
     return settings.model_copy(update={"simulation": simulation, "schedule": ()})
 

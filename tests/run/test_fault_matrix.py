@@ -165,9 +165,25 @@ def assert_whole(record: Record, said: list[str]) -> None:
     assert (record.folder / "trip.csv").exists() == (record.summary["trip_cycle"] is not None)
 
 
+def played() -> list[tuple[Case, str]]:
+    """Every case on sockets; over python-can every fault once, when it begins last.
+
+    Both have the same rules of a cycle. What only python-can may get wrong is how frames come and
+    go, and that does not depend on when a fault begins.
+    """
+    last = {case.fault: case for case in cases()}
+    return [
+        *((case, "native") for case in cases()),
+        *((case, "python-can") for case in last.values()),
+    ]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("exchange", ["python-can", "native"])
-@pytest.mark.parametrize("case", cases(), ids=lambda case: f"{case.fault}, {case.when}")
+@pytest.mark.parametrize(
+    ("case", "exchange"),
+    played(),
+    ids=lambda given: given if isinstance(given, str) else f"{given.fault}, {given.when}",
+)
 def test_case(
     case: Case,
     exchange: str,

@@ -38,8 +38,6 @@ ENABLE_OPERATION = 0x0F
 
 #: A hand that stays on the wall.
 CHANGES = ON_A_BUSY_MACHINE | {
-    "wait_s = 5.0": "wait_s = 20.0\nwatchdog_s = 0.5",
-    "ramp_cycles = 10": "ramp_cycles = 1000\nlate_cycles = 0",
     "press_s = 0.5": "press_s = 3000.0",
     "strikes = 4\n": "strikes = 1\n",
     "interval_s = 1.0": "interval_s = 4000.0",

@@ -138,7 +138,8 @@ def test_scripts_are_read_and_written(tmp_path: Path) -> None:
         ),
         (
             {"grip": False, "press_rad": 0.1},
-            "simulation.hand: grip = false: press_rad has to differ from rest_rad, to give the hand a side",
+            "simulation.hand: grip = false: press_rad has to differ from rest_rad, "
+            "to give the hand a side",
         ),
         (
             {"grip": False, "inertia_kg_m2": 0.0},
