@@ -22,10 +22,12 @@ from rig import Rig, RigFactory
 
 import canwall.record.recorder
 
-# A shell without job control starts what it puts into the background with SIGINT ignored, and
-# canwall leaves it so: its tests are to mean the same there.
+# A shell without job control starts what it puts into the background with SIGINT ignored, nohup
+# does so with SIGHUP, and canwall leaves it so: its tests are to mean the same there.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 # No example fails for the time it takes.
 hypothesis.settings.register_profile("untimed", deadline=None)

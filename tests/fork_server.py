@@ -137,6 +137,7 @@ class Program:
         os.environ.update(self.environment)
         sys.path[: len(before)] = _search_path(os.environ)
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
     def _run(self) -> None:
         """Do what Python does with the arguments."""

@@ -350,6 +350,7 @@ def test_others_may_ask_the_drive_while_it_runs_in_real_time(
         wait_for(lambda: is_enabled(folder / "bus.log"))
         for _ in range(20):
             assert node.sdo[0x6041].raw & 0x6F == 0x27
+        wait_for(lambda: torque_is_on(folder / "bus.log"))
         running.terminate()
         assert running.wait(PATIENCE_S) == 130
         assert node.sdo[0x6041].raw & 0x6F == 0x40
