@@ -477,7 +477,9 @@ _open_buses: weakref.WeakSet[UnixBus] = weakref.WeakSet()
 def _leave_to_parent() -> None:
     """Close the buses in a forked child: with its copies open, nobody would see the parent die."""
     for bus in list(_open_buses):
-        bus._abandon()
+        # The numbers of what is closed belong to others by now.
+        if not bus._is_shutdown:
+            bus._abandon()
 
 
 os.register_at_fork(after_in_child=_leave_to_parent)

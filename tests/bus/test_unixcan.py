@@ -404,6 +404,26 @@ def test_stale_socket_of_a_killed_hub_is_replaced(channel: Path, join: Join, spa
     assert_talk(one, two, 1)
 
 
+def test_forked_child_keeps_what_was_opened_after_a_bus_was_closed(join: Join) -> None:
+    bus = join()
+    bus.shutdown()
+    pipes = [os.pipe() for _ in range(4)]  # some have the numbers that the bus had
+    child = os.fork()
+    if child == 0:
+        try:
+            for pipe in pipes:
+                for descriptor in pipe:
+                    os.fstat(descriptor)
+        except OSError:
+            os._exit(1)
+        os._exit(0)
+    for pipe in pipes:
+        for descriptor in pipe:
+            os.close(descriptor)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert bus.channel_info
+
+
 def test_hub_with_a_forked_child_still_dies_for_the_others(
     channel: Path, join: Join, spawn: Spawn
 ) -> None:
