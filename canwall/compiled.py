@@ -3,6 +3,11 @@
 import contextlib
 import functools
 import hashlib
+import math
+import os
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ParamSpec, TypeAlias, TypeVar
@@ -22,8 +27,10 @@ Record: TypeAlias = Any
 _WITHOUT_COMPILED_CODE = ("bench", "cli", "config", "study", "sweep", "workbench")
 
 
-def _drop_stale_code() -> None:
+def _drop_stale_code() -> bool:
     """Remove compiled code that was kept on disk before a source that it may depend on changed.
+
+    Returns True if there is none of today's sources: this is a first start.
 
     numba sees a change of the file that a function stands in, not of those that it calls into: a
     law would go on using the estimator of the day on which it was compiled.
@@ -39,14 +46,60 @@ def _drop_stale_code() -> None:
     note = package / "__pycache__" / "sources.sha256"
     with contextlib.suppress(OSError):  # an installation that may not be written keeps no code
         if note.exists() and note.read_text() == digest:
-            return
+            return False
         for kept in (*package.rglob("*.nbi"), *package.rglob("*.nbc")):
             kept.unlink(missing_ok=True)
         note.parent.mkdir(exist_ok=True)
         note.write_text(digest)
+        return True
+    return False
 
 
-_drop_stale_code()
+_first_start = _drop_stale_code()
+
+
+class _Compiling:
+    """The work of compiling in this process, and whom to tell when it gets long."""
+
+    #: Seconds of compiling that go without a word.
+    SILENT_S = 1.0
+
+    def __init__(self) -> None:
+        self.tell: Callable[[], None] | None = None
+        self._last_s = -math.inf
+        self._spent_s = 0.0
+
+    def note_miss(self) -> None:
+        """Note that a function is compiled now; a long first start has one after the other."""
+        now_s = time.monotonic()
+        self._spent_s += min(now_s - self._last_s, 0.3)
+        self._last_s = now_s
+        if self.tell is not None and self._spent_s > self.SILENT_S:
+            tell, self.tell = self.tell, None
+            tell()
+
+
+_compiling = _Compiling()
+
+
+def announce_compiling(tell: Callable[[], None]) -> None:
+    """Have `tell` called, once, when what this process compiles takes more than a moment."""
+    _compiling.tell = tell
+
+
+_beside: list[subprocess.Popen[bytes]] = []
+
+
+def compile_beside(module: str, function: str) -> None:
+    """Let another process compile, at a first start, by calling the function of that module.
+
+    Nobody waits for it: what it has on disk in time is loaded, the rest is compiled here too.
+    """
+    if _first_start and not _beside and (os.cpu_count() or 1) > 1:
+        nowhere = subprocess.DEVNULL
+        program = f"from {module} import {function}; {function}()"
+        arguments = [sys.executable, "-P", "-c", program]
+        _beside.append(subprocess.Popen(arguments, stdin=nowhere, stdout=nowhere, stderr=nowhere))
 
 
 @functools.cache
@@ -61,10 +114,20 @@ def _code_on_disk() -> Any:
     from numba.core.runtime import rtsys
 
     class CodeOnDisk(FunctionCache):  # type: ignore[misc]
+        def __init__(self, function: Callable[..., Any], use: str) -> None:
+            super().__init__(function)
+            self._use = use
+
         def load_overload(self, sig: Any, target_context: Any) -> Any:
             rtsys.initialize(target_context)
             with self._guard_against_spurious_io_errors():
-                return self._load_overload(sig, target_context)
+                code = self._load_overload(sig, target_context)
+            if code is None:
+                _compiling.note_miss()
+            return code
+
+        def _index_key(self, sig: Any, codegen: Any) -> Any:
+            return (*super()._index_key(sig, codegen), self._use)
 
     return CodeOnDisk
 
@@ -73,7 +136,8 @@ class _Compiled:
     """A function that is compiled when it is first called, by Python or by compiled code.
 
     numba takes long to import; whoever merely imports a module with such a function in it does
-    not wait for that.
+    not wait for that. For compiled code it is compiled apart, without what Python calls it by,
+    and once for all constants that it is called with: either saves a fifth of a first start.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -81,20 +145,46 @@ class _Compiled:
         self._function = function
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        return self._dispatcher(*args, **kwargs)
+        return self._for_python(*args, **kwargs)
 
-    @functools.cached_property
-    def _dispatcher(self) -> Any:
-        from numba import njit
+    def compile(self, *examples: Any) -> None:
+        """Compile for a call with arguments of the types of these, without calling."""
+        from numba import typeof
 
-        dispatcher = njit(nogil=True, error_model="numpy")(self._function)
-        dispatcher._cache = _code_on_disk()(self._function)
-        return dispatcher
+        self._for_python.compile(tuple(typeof(example) for example in examples))
 
     @property
     def _numba_type_(self) -> Any:
         """What numba takes it for where compiled code calls it."""
-        return self._dispatcher._numba_type_
+        return self._for_compiled_code._numba_type_
+
+    @functools.cached_property
+    def _for_python(self) -> Any:
+        return self._dispatcher("Python")
+
+    @functools.cached_property
+    def _for_compiled_code(self) -> Any:
+        from numba.types import unliteral
+
+        dispatcher = self._dispatcher(
+            "compiled code", no_cpython_wrapper=True, no_cfunc_wrapper=True
+        )
+        template = dispatcher.get_call_template
+
+        def template_of_any_value(args: Any, kws: Any) -> Any:
+            return template(
+                tuple(unliteral(a) for a in args), {name: unliteral(a) for name, a in kws.items()}
+            )
+
+        dispatcher.get_call_template = template_of_any_value
+        return dispatcher
+
+    def _dispatcher(self, caller: str, **options: bool) -> Any:
+        from numba import njit
+
+        dispatcher = njit(nogil=True, error_model="numpy", **options)(self._function)
+        dispatcher._cache = _code_on_disk()(self._function, caller)
+        return dispatcher
 
 
 def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
@@ -115,7 +205,7 @@ def compiled_for_c(function: Callable[..., Any], signature: Any, kept: bool = Tr
 
     result: Any = CFunc(function, normalize_signature(signature), {}, {"error_model": "numpy"})
     if kept:
-        result._cache = _code_on_disk()(function)
+        result._cache = _code_on_disk()(function, "C")
     result.compile()
     return result
 

@@ -7,6 +7,8 @@ from typing import Any, NoReturn
 import typer
 
 from canwall.cli.ending import guarded
+from canwall.cli.output import say
+from canwall.compiled import announce_compiling
 
 
 def make_program(**settings: Any) -> typer.Typer:
@@ -21,6 +23,9 @@ def make_program(**settings: Any) -> typer.Typer:
 
 def run_program(program: typer.Typer) -> NoReturn:
     """Run the program with the arguments of the process and exit with its exit code."""
+    announce_compiling(
+        lambda: say("compiling for this machine, about half a minute; later starts have it on disk")
+    )
     code = guarded(lambda: program(standalone_mode=False))
     # At its end Python looks for garbage among all that was ever imported, for longer than a
     # command may take; all of it goes with the process.

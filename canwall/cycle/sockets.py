@@ -25,7 +25,7 @@ from canwall.bus.raw_socket import (
     wait_readable,
 )
 from canwall.compiled import Record, compiled
-from canwall.cycle.core import Want, proceed, take
+from canwall.cycle.core import CORE, Want, proceed, take
 from canwall.cycle.transport import CycleFrames
 from canwall.drive import Link
 
@@ -58,6 +58,11 @@ SOCKET = np.dtype(
     ],
     align=True,
 )
+
+
+def compile_run() -> None:
+    """Compile what `SocketTransport.run` calls."""
+    _run.compile(np.zeros(1, CORE), np.zeros(1, SOCKET))  # type: ignore[attr-defined]
 
 
 class SocketTransport:

@@ -8,6 +8,7 @@ import can
 
 from canwall import simdrive
 from canwall.bus import reason, socket_pair
+from canwall.compiled import compile_beside
 from canwall.config import ConfigError, Settings
 from canwall.drive import Link, refuse_second_master
 
@@ -98,6 +99,7 @@ def on_the_bus(*many: Settings) -> Iterator[Link]:
     with ExitStack() as stack:
         if len(many) == 1 and _is_alone(many[0]):
             bus, drive_bus = (stack.enter_context(end) for end in socket_pair(many[0].bus.channel))
+            compile_beside("canwall.cycle.sockets", "compile_run")  # here it is the drive's turn
             runner = simdrive.SocketRunner(drives[0], drive_bus)
             yield Link(bus, runner.poll, runner.compiled)
             return
