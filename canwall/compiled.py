@@ -1,4 +1,4 @@
-"""How this project compiles: one decorator, and one name for a record in compiled code."""
+"""Compilation with numba: one decorator, and one type for records in compiled code."""
 
 import contextlib
 import functools
@@ -155,7 +155,7 @@ class _Compiled:
 
     @property
     def _numba_type_(self) -> Any:
-        """What numba takes it for where compiled code calls it."""
+        """Numba's type of the function, where compiled code calls it."""
         return self._for_compiled_code._numba_type_
 
     @functools.cached_property

@@ -90,5 +90,5 @@ def zoh_of(mass: float, viscous: float, spring: float, period: float) -> tuple[A
 
 
 def bounces(y: Array) -> int:
-    """How many times the ball came out of the floor between two samples."""
+    """Return the number of times that the ball left the floor between two samples."""
     return int(np.count_nonzero((y[:-1] < 0.0) & (y[1:] >= 0.0)))

@@ -130,7 +130,7 @@ def read_log(path: Path) -> list[can.Message]:
 
 
 def same_signals(one: Record, other: Record, rows: int | None = None) -> bool:
-    """Whether two runs have the same (first) rows, bit by bit, but for what the clock decides."""
+    """Return True if the (first) rows of two runs are equal bit by bit, apart from timing."""
     columns = [n for n in one.signals.column_names if n not in ("sync_interval_s", "latency_s")]
     a, b = (record.signals.select(columns).slice(0, rows) for record in (one, other))
     for name in columns:
@@ -148,12 +148,12 @@ def wait_for(condition: Callable[[], bool]) -> None:
 
 
 def torque_is_on(bus_log: Path) -> bool:
-    """Whether the log has an RPDO with a torque by now."""
+    """Return True once the log has an RPDO with a torque."""
     return any(word[8:12] != b"0000" for word in _enabling_rpdos(bus_log))
 
 
 def is_enabled(bus_log: Path) -> bool:
-    """Whether the log has an RPDO by now that keeps the drive enabled."""
+    """Return True once the log has an RPDO that keeps the drive enabled."""
     return bool(_enabling_rpdos(bus_log))
 
 

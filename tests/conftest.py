@@ -1,4 +1,4 @@
-"""What the tests share: rigs and programs that are ended with the test, and one recorded run.
+"""Fixtures for all tests: rigs and programs that end with the test, and one recorded run.
 
 And the rule for the mark `slow`, see `slow` in pyproject.toml.
 """

@@ -173,7 +173,7 @@ def lack(rig: Rig, *missing: int) -> None:
 
 
 class Loop:
-    """What `canwall run` builds around a drive that is set up, on a rig, without a writer."""
+    """Loop on a rig, assembled around a set-up drive as by `canwall run`, without a writer."""
 
     def __init__(self, rig: Rig, real_time: bool = False) -> None:
         self.rig = rig

@@ -1,4 +1,4 @@
-"""What was compiled before a source changed is not used after."""
+"""Code that was compiled before a change of the sources is not used afterwards."""
 
 import shutil
 import subprocess

@@ -15,7 +15,7 @@ BOUNDED = settings(derandomize=True, deadline=None, max_examples=60)
 OWN = shipped("eds/canwall-drive.eds")
 VENDORS = Path(__file__).resolve().parents[2] / "shared" / "vendor-eds"
 
-#: What rendering a wall takes of a CiA 402 drive in cyclic synchronous torque mode.
+#: Objects needed to render a wall on a CiA 402 drive in cyclic synchronous torque mode.
 WALL_OBJECTS = (0x6040, 0x6041, 0x6060, 0x6061, 0x6064, 0x6071, 0x6077)
 
 #: Files of real devices, and what they lack.

@@ -1,4 +1,4 @@
-"""What is forked is as what is started: streams, signals, folder, environment, end."""
+"""A forked program is like one that is started: streams, signals, folder, environment, end."""
 
 import os
 import signal

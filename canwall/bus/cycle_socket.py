@@ -52,7 +52,7 @@ class CycleSocket:
         """
         self._bus = bus
         self._own: socket.socket | None = None
-        #: Whether its frames have the kernel's time stamps.
+        #: True if received frames carry the kernel's time stamps.
         self.stamped = False
         if isinstance(bus, FrameSocket):
             self._stamps = stamps

@@ -53,11 +53,11 @@ PORT = np.dtype(
 )
 _FRAME_SIZE = CAN_FRAME.itemsize
 
-#: What `receive` and `send` return besides 1, a frame: none now, the other side has gone, errno.
+#: Results of `receive` and `send`: a frame; none waiting; closed by the other side; error in errno.
 FRAME, NOTHING, CLOSED, FAILED = 1, 0, -1, -2
 
-#: How long a network interface's transmit queue may stay full (ENOBUFS): one of ten frames empties
-#: in 11 ms at 125 kbit/s. No poll tells when there is room; it is tried again after so long.
+#: Longest time that a network interface's transmit queue may stay full (ENOBUFS), and the interval
+#: of the retries, since no poll reports room. A queue of ten frames empties in 11 ms at 125 kbit/s.
 QUEUE_PATIENCE_NS, QUEUE_RETRY_NS = 50_000_000, 200_000
 
 _CLOCK_REALTIME, _CLOCK_MONOTONIC, _TIMER_ABSTIME = 0, 1, 1

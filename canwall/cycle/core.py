@@ -35,7 +35,7 @@ from canwall.record.ring import (
 SPIN_NS = 200_000
 #: Frames that may wait for Python between two of its turns.
 INBOX = 1 << 12
-#: How full the rings of the record may be before simulated time waits for their writer.
+#: Fill level of the record's rings above which simulated time waits for the writer.
 BACKLOG = 0.5
 
 _OPERATIONAL = 5
@@ -68,7 +68,7 @@ class Want(IntEnum):
 # The enum's values as plain numbers for the compiled code.
 (_SEND, _FRAME, _DRAIN, _SLEEP, _SPIN, _DONE, _HAND_OVER, _WRITER, _SYNC_LOST) = map(int, Want)
 
-#: Where a cycle is.
+#: Stages of a cycle.
 _BEFORE, _DRAINING, _SYNC_DUE, _SYNC_SENT, _SYNC_AWAITED, _TPDO_AWAITED, _RPDO_SENT, _AFTER = range(
     8
 )

@@ -27,7 +27,7 @@ _SEED = 402
 _EXPLAINED = 0.5
 #: Delays from which the fit begins, in periods.
 _GUESSES = np.arange(0.0, MAX_DELAY + 0.1, 0.5)
-#: How far a pair of torques is to move the handle [rad]: many counts, and little for a hand.
+#: Travel of the handle under a pair of torques [rad]: many counts, yet hardly felt by a hand.
 _TRAVEL_RAD = 0.01
 #: The longest torque, and the moving average, in cycles.
 _LONGEST, _AVERAGED = 8, 33

@@ -91,7 +91,7 @@ class Exchange:
         self.ahead = 1
         #: Intervals of the SYNC, and how far each is from its period.
         self.sync_interval, self.sync_error = np.zeros(1, HISTOGRAM), np.zeros(1, HISTOGRAM)
-        #: Whether simulated time waits for the writer of the record; False once it has died.
+        #: True while simulated time waits for the writer of the record; False once that has died.
         self.waits_for_writer = True
         self._inbox, self._unlogged = _FrameRing(), _FrameRing()
         self._error_control = _error_control_frames(axis.setup.watchdog for axis in axes)

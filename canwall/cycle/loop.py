@@ -34,7 +34,7 @@ from canwall.record import Phase
 
 #: Cycles within which a drive has to reach OPERATION ENABLED.
 _ENABLE_CYCLES = 2000
-#: How long a drive may take to leave it by RPDO, before SDO takes its voltage [s, cycles].
+#: Time for a drive to leave OPERATION ENABLED by RPDO before it is disabled by SDO [s, cycles].
 _LEAVE_S, _LEAVE_CYCLES = 0.1, 20
 #: Cycles without a TPDO after which a drive counts as silent while enabling and leaving.
 _SILENT_CYCLES = 50

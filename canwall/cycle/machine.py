@@ -22,7 +22,7 @@ _UDEV_RULE = (
     "in /etc/udev/rules.d/99-cpu-dma-latency.rules, for a group that you are in: "
     'KERNEL=="cpu_dma_latency", GROUP="realtime", MODE="0660"'
 )
-#: How soon another Python thread gives the interpreter back between two looks of the loop [s].
+#: Longest time that another Python thread keeps the interpreter while the loop waits for it [s].
 _SWITCH_INTERVAL_S = 1e-4
 
 

@@ -30,7 +30,7 @@ class PythonCanTransport:
         self._out = core["out"][0]
         self._until_ns = core["until_ns"]
         self._messages = {can_id: _message(can_id) for can_id in frames.sent}
-        #: Whether a message's time stamp is the kernel's, by CLOCK_REALTIME.
+        #: True if messages carry the kernel's time stamp (CLOCK_REALTIME).
         self._stamped = type(link.bus).__module__.startswith("can.interfaces.socketcan")
         # What is compiled is loaded at its first call, which takes longer than many a cycle.
         scratch = core.copy()

@@ -36,8 +36,8 @@ POLL_NS = 30_000
 #: cycle in real time.
 _SEND_PATIENCE_S, _SEND_SHARE = 1.0, 0.2
 
-#: Why `_run` returns besides a `Want`: the idle function is to be called in Python; the other side
-#: has closed; a call failed with `errno` in the port.
+#: Results of `_run` besides a `Want`: the idle function has to be called in Python; the other side
+#: has closed; a call has failed, with `errno` in the port.
 _IDLE, _GONE, _ERRNO = 100, 101, 102
 _SEND, _FRAME, _DRAIN, _SLEEP, _SPIN = map(
     int, (Want.SEND, Want.FRAME, Want.DRAIN, Want.SLEEP, Want.SPIN)

@@ -1,4 +1,4 @@
-"""What faults act on: a drive and its encoder, as far as faults reach into them."""
+"""Targets of faults: the parts of a drive and its encoder that faults act on."""
 
 from typing import Protocol, TypeAlias
 

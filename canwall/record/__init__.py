@@ -1,4 +1,4 @@
-"""What a run leaves behind: one row per cycle, every frame, and a summary.
+"""Record of a run: one row per cycle, every frame, and a summary.
 
 The cycle writes into a ring in shared memory and never waits for a disk; a process of its own
 (`writer`) empties the ring into the run's folder, and completes the files even if the master dies.

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class Phase(IntEnum):
-    """What a cycle was for."""
+    """Purpose of a cycle."""
 
     ENABLING = 0
     RENDERING = 1

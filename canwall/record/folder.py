@@ -21,7 +21,7 @@ _TRIP_CYCLES = 200
 
 
 def stream_of(signals: Path) -> Path:
-    """Where the rows are while the run goes on: a stream that can be read without its end."""
+    """Return the path of the rows during the run: a stream that is readable while incomplete."""
     return signals.with_suffix(".arrows")
 
 
@@ -108,32 +108,32 @@ class RunFolder:
 
     @property
     def signals(self) -> Path:
-        """One row per cycle."""
+        """Path of the signals: one row per cycle (Parquet)."""
         return self.path / "signals.parquet"
 
     @property
     def summary(self) -> Path:
-        """What came of it."""
+        """Path of the summary (JSON)."""
         return self.path / "summary.json"
 
     @property
     def config(self) -> Path:
-        """The configuration as resolved."""
+        """Path of the resolved configuration (TOML)."""
         return self.path / "config.toml"
 
     @property
     def picture(self) -> Path:
-        """The run at a glance."""
+        """Path of the picture of the run."""
         return self.path / "run.png"
 
     @property
     def live(self) -> Path:
-        """While the run goes on: where its changes are posted."""
+        """Path of a file that exists during the run and holds the address for changes."""
         return self.path / "live.json"
 
     @property
     def trip(self) -> Path:
-        """The last cycles before a trip, every column, for a spreadsheet."""
+        """Path of the last cycles before a trip, with every column, for a spreadsheet."""
         return self.path / "trip.csv"
 
     def write_trip(self, signals: "pa.Table", cycle: int) -> None:

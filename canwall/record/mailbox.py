@@ -41,7 +41,7 @@ class Mailbox:
 
     @property
     def address(self) -> str:
-        """How other processes of this machine open it, as long as this one lives."""
+        """Address by which other processes on this machine open it while this process lives."""
         return f"/proc/{os.getpid()}/fd/{self._descriptor}"
 
     def close(self) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 from canwall.errors import RunFailedError
 from canwall.record.ring import Ring
 
-#: How long a writer may take to complete its files after the run, or to draw [s].
+#: Time limit for the writer to complete its files after the run, or to draw [s].
 _TIMEOUT_S = 60.0
 
 
@@ -87,7 +87,7 @@ class Recorder:
             self._writer.stdin.write(json.dumps(order).encode() + b"\n")
 
     def _answer(self) -> str:
-        """What went wrong, empty if nothing."""
+        """Return the writer's error message, empty if all went well."""
         assert self._writer.stdout is not None
         line, deadline = b"", time.monotonic() + _TIMEOUT_S
         while not line.endswith(b"\n"):

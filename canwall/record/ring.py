@@ -99,7 +99,7 @@ class Ring:
         )
 
     def backlog(self) -> float:
-        """How full the fuller of the two rings is, 0 … 1."""
+        """Fill level of the fuller of the two rings, from 0 to 1."""
         header = self.header[0]
         rows = (header["row_head"] - header["row_tail"]) / ROWS
         frames = (header["frame_head"] - header["frame_tail"]) / FRAMES

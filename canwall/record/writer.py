@@ -32,7 +32,7 @@ from canwall.record.ring import Ring, to_message
 #: Rows of one row group, unless the run ends before.
 _ROW_GROUP = 8192
 _POLL_S = 0.02
-#: How much of a run a loss of power may take.
+#: Interval of synchronisation to disk: the most of a run that a power failure can lose [s].
 _SYNCHRONISE_S = 0.5
 
 

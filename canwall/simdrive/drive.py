@@ -182,7 +182,7 @@ class SimulatedDrive:
 
     @property
     def actuator(self) -> Actuator:
-        """What the demanded torque passes on its way to the motion."""
+        """Path of the demanded torque to the motion."""
         return self._actuator
 
     @property

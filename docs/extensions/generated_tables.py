@@ -82,7 +82,7 @@ class Commands(_Generated):
         return f"`{shown}`", parameter.help, default
 
 
-#: What TOML calls the types, and a word for each bound of a number.
+#: Names of the types in TOML, and words for the bounds of a number.
 _IN_TOML = {
     float: "number",
     int: "integer",
@@ -130,7 +130,7 @@ def _sections_in(annotation: Any) -> list[type[BaseModel]]:
 
 
 def _values(annotation: Any, metadata: Sequence[Any] = ()) -> str:
-    """What a key may be, in TOML's words."""
+    """Return the values that a key may have, in TOML's terms."""
     if hasattr(annotation, "__metadata__"):
         return _values(annotation.__origin__, [*metadata, *annotation.__metadata__])
     for inner in metadata:  # pydantic keeps the bounds of an optional number in a field of its own
@@ -167,7 +167,7 @@ class RecordedColumns(_Generated):
 
 
 class SweepMeasures(_Generated):
-    """What a sweep measures of each strike: `{sweep-measures}`."""
+    """Measures of each strike in a sweep: `{sweep-measures}`."""
 
     def lines(self) -> Iterator[str]:
         """A table of name, unit and meaning."""

@@ -33,7 +33,7 @@ _PERIODS = 3000
 _BALLS, _STEPS = 20, 300
 #: θ = 0.1: some forty samples to a contact.
 _BALL = Ball(periods=_PERIODS)
-#: Where a law's own ones would throw this ball so high that it hardly ever comes back.
+#: Options of laws whose defaults would throw this ball so high that it hardly ever comes back.
 _OPTIONS = {"exponential": {"length": 2.0}}
 
 

@@ -115,7 +115,7 @@ class _EnabledDrive:
 
     @property
     def setup(self) -> DriveSetup:
-        """What the drive's set-up came to."""
+        """Set-up of the drive."""
         return self.axis.setup
 
     @property

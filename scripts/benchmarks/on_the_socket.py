@@ -44,7 +44,7 @@ _CYCLES = 4000
 _TURNS = 7
 _REAL_TIME_TURNS = 3
 _SIMULATED_S = 30.0
-#: What the C program's drive sends and takes.
+#: PDOs of the drive in the C program.
 _TPDO = PdoLayout(
     0x185, (Field(0x6064, 0, 0, 32), Field(0x6041, 0, 32, 16), Field(0x6077, 0, 48, 16))
 )

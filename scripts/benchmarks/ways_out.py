@@ -1,4 +1,4 @@
-"""How long it takes until a dead or dying master's torque is gone, on unixcan and in real time."""
+"""Time until the torque of a dead or dying master is gone, on unixcan and in real time."""
 
 import signal
 import statistics
@@ -115,7 +115,7 @@ def _turn(missing: tuple[str, ...], number: int) -> tuple[float, float, float]:
 
 
 class _Frames:
-    """What is on the bus, and when the last RPDO with a torque was."""
+    """Frames on the bus, and the time of the last RPDO with a torque."""
 
     def __init__(self, bus: can.BusABC) -> None:
         self._bus = bus

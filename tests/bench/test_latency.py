@@ -1,4 +1,4 @@
-"""What `canwall latency` measures, what it makes of it, and that the drive stays as it was."""
+"""`canwall latency`: measurement, report, and a drive that stays as it was."""
 
 import csv
 import json

@@ -33,7 +33,7 @@ def listener() -> Iterator[VirtualBus]:
 
 
 class Said:
-    """What one command came to."""
+    """Exit code and output of one command."""
 
     def __init__(self, code: object, out: str, err: str) -> None:
         self.code, self.out, self.err = code, out, err
@@ -295,7 +295,7 @@ def test_what_is_wrong_in_a_program_is_not_hidden(
 
 
 def on_a_terminal(*arguments: object) -> str:
-    """What a command writes to stderr where that is a terminal."""
+    """Return what a command writes to stderr when that is a terminal."""
     ours, theirs = os.openpty()
     with subprocess.Popen(
         [COMMAND, *map(str, arguments)],

@@ -57,7 +57,7 @@ def loaded(file: Path) -> Load:
 
 
 def refused(file: Path, overrides: dict[str, object] | None = None) -> str:
-    """What is said of a file, without its name: one line that begins with it."""
+    """Return the error message for a file without the file name, which begins its only line."""
     with pytest.raises(ConfigError) as caught:
         load(file, overrides)
     message = str(caught.value)

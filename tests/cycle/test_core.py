@@ -29,7 +29,7 @@ Frame = tuple[int, int, int]
 
 
 def no_transport(link: Link, core: object, frames: object) -> Transport:
-    """What never moves a frame: the bench does."""
+    """Make a transport that never moves a frame; the bench does that."""
     return cast(Transport, SimpleNamespace(run=lambda: Want.DONE))
 
 

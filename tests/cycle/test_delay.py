@@ -13,7 +13,7 @@ from canwall.record import Phase
 
 COUNT = 2.0 * np.pi / 131072
 PERIOD = 1e-3
-#: What the master believes of the handle.
+#: The master's model of the handle.
 KNOWN = Mechanics(inertia_kg_m2=2e-4, viscous_nm_s_per_rad=1e-3)
 
 

@@ -303,7 +303,7 @@ def test_fault_that_comes_back_after_every_reset(make_rig: RigFactory) -> None:
 
 
 def trip_of(loop: Loop, happens: Callable[[int], None]) -> str:
-    """What ends the run when something happens in the middle of the contact."""
+    """Return the text of the trip when something happens in the middle of the contact."""
 
     def once(j: int) -> bool:
         if j == PRESSING:

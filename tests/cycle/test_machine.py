@@ -87,7 +87,7 @@ def give_up_privileges():
 
 
 def of_process(program: str) -> Any:
-    """What a program says, that is run in a process of its own, as JSON."""
+    """Run a program in a process of its own and return its JSON output."""
     done = subprocess.run(
         [sys.executable, "-c", UNPRIVILEGED + program],
         capture_output=True,

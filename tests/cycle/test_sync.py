@@ -1,4 +1,4 @@
-"""Whose SYNC it is, and whether it counts."""
+"""SYNC: its producer and its counter."""
 
 import can
 import pytest

@@ -1,4 +1,4 @@
-"""What a trip says of a master that was not there."""
+"""Text of a trip after a pause of the master."""
 
 import pytest
 from rig import Loop, RigFactory, lack, settings_with

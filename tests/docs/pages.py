@@ -11,9 +11,9 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md")])
 
-#: What blocks may be in: played, or what a program prints.
+#: Languages of blocks: three that are played, and text for the output of a program.
 LANGUAGES = ("sh", "python", "toml", "text")
-#: Why a block cannot be played, as it says behind its language.
+#: Words after the language of a block that is not played, and the reasons they stand for.
 UNPLAYED = {
     "root": "changes the machine",
     "interactive": "waits for a person",

@@ -39,7 +39,7 @@ PROGRAMS = {
 }
 #: Not played from within the tests.
 SCRIPTS = ("scripts/test",)
-#: What a part of a configuration is a part of.
+#: Configuration that completes a part of one.
 BASE = {
     "drive": {"node_id": 5, "eds": "eds/canwall-drive.eds"},
     "mechanics": {"inertia_kg_m2": 1.64e-4},
@@ -186,7 +186,7 @@ class Player:
 
 
 def commands(block: Block) -> Iterator[tuple[str, list[str]]]:
-    """Where each command of a block stands, and its words; a backslash joins two lines."""
+    """Yield the place and the words of each command in a block; a backslash joins two lines."""
     text, first = "", block.line
     for line, part in enumerate(block.text.splitlines(), start=block.line):
         first = first if text else line

@@ -1,4 +1,4 @@
-"""What the documentation says of the code and of itself, without building or running it."""
+"""References of the documentation to the code and to itself, without building or running it."""
 
 import re
 import shlex
@@ -41,7 +41,7 @@ def test_commands_in_sentences_exist() -> None:
 
 
 def exists(command_line: str) -> bool:
-    """Whether there is such a command, with such options."""
+    """Return True if the command and its options exist."""
     program, *words = shlex.split(command_line)
     if program != "canwall":
         return (ROOT / program).exists()

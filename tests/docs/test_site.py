@@ -32,7 +32,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Loading(HTMLParser):
-    """What a browser loads for a page: not where its links lead."""
+    """Resources that a browser loads for a page; the targets of links are not among them."""
 
     def __init__(self, text: str) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Who answers, and whether the dictionary is its own."""
+"""Identity of the drive, compared with its dictionary."""
 
 import pytest
 from rig import Rig, RigFactory, settings_with

@@ -1,4 +1,4 @@
-"""Which torque mode the master chooses, and how it says why."""
+"""Torque mode that the master chooses, and the reason it gives."""
 
 import pytest
 from rig import Rig, RigFactory, settings_with

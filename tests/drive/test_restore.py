@@ -1,4 +1,4 @@
-"""What the set-up changes, `restore` undoes; what cannot be undone is said."""
+"""`restore` undoes the changes of the set-up, and reports those that cannot be undone."""
 
 import contextlib
 

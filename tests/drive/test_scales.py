@@ -1,4 +1,4 @@
-"""What one count is: the factor group and the units of CiA 402-2, or the key that is missing."""
+"""Size of a count: factor group and units of CiA 402-2, or the name of the missing key."""
 
 import math
 

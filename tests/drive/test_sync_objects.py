@@ -1,4 +1,4 @@
-"""What a drive expects of the SYNC: its window and its period are made to fit the cycle."""
+"""Objects of the SYNC: its window and its period are made to fit the cycle."""
 
 import pytest
 from rig import Loop, RigFactory, settings_with

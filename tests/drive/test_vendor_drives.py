@@ -77,7 +77,7 @@ def test_what_the_master_finds(drive: Drive, rig: Rig) -> None:
 
 
 def test_scales_are_those_of_the_motion(drive: Drive, rig: Rig) -> None:
-    """What the master makes of the first position is where the simulated handle rests."""
+    """The master reads the first position as the one at which the simulated handle rests."""
     assert rig.settings.simulation is not None
     units = rig.set_up().units
     assert units.rated_torque_nm == pytest.approx(drive.rated_torque_nm)

@@ -1,4 +1,4 @@
-"""Which watchdog is set, with what time, what the master has to send, and that it bites."""
+"""Set-up of the watchdog: its choice, its time, the master's frames for it, and its effect."""
 
 import math
 

@@ -20,7 +20,7 @@ Event = Callable[[float, Array], float]
 
 @dataclass(frozen=True)
 class Handle:
-    """What moves and what it moves against; the fields are those of `physics.make_plant`."""
+    """Moving mass and the forces on it; the fields are those of `physics.make_plant`."""
 
     mass: float
     viscous: float = 0.0
@@ -48,7 +48,7 @@ def moved(
 
 
 def touches(handle: Handle, y: float, v: float, u0: float, u1: float, duration: float) -> bool:
-    """Whether the wall acts in the motion under test."""
+    """Return True if the wall acts in the motion under test."""
     return advance(make_plant(*astuple(handle))[0], y, v, u0, u1, duration)[2]
 
 
@@ -63,7 +63,7 @@ def or_zero(low: float, high: float) -> st.SearchStrategy[float]:
 
 @dataclass
 class Reference:
-    """Where the motion ends, and what happened on the way."""
+    """End of the motion, and events on the way."""
 
     y: float
     v: float

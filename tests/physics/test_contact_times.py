@@ -1,4 +1,4 @@
-"""When a contact begins and ends, against closed forms and scipy's event search."""
+"""Begin and end of a contact, compared with closed forms and SciPy's event search."""
 
 import math
 from dataclasses import astuple

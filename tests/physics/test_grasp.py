@@ -123,7 +123,7 @@ def test_any_motion_is_that_of_the_event_search(
 def test_the_hand_is_never_pulled_nor_beyond_the_handle(
     case: tuple[Handle, HandBody, Grasp, Force, Force],
 ) -> None:
-    """What the contact must have given the hand over a short time, by the hand's own motion."""
+    """The impulse of the contact over a short time agrees with the motion of the hand."""
     handle, hand, now, motor, script = case
     step = 2.0**-7
     for j in range(128):

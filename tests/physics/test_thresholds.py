@@ -1,4 +1,4 @@
-"""Where a comparison could go either way: motion on the edge of sticking, and what is no number."""
+"""Edge cases of comparisons: motion on the edge of sticking, and values that are not numbers."""
 
 import math
 

@@ -16,13 +16,13 @@ from canwall.physics import Force, Grasp, HandBody, advance_grasp, make_plant
 
 Array = NDArray[np.float64]
 
-#: What is zero all the time is no event.
+#: Below this a quantity counts as zero throughout, and has no event.
 NOTHING = 1e-14
 
 
 @dataclass(frozen=True)
 class Handle:
-    """What the handle is: its parameters, as `physics.make_plant` has them."""
+    """Parameters of the handle, named as in `physics.make_plant`."""
 
     mass: float
     viscous: float = 0.0
@@ -50,7 +50,7 @@ class Handle:
 
 @dataclass
 class Log:
-    """What happened on the way."""
+    """Numbers of events on the way."""
 
     partings: int = 0
     impacts: int = 0
@@ -102,7 +102,7 @@ def integrate(
     max_step: float,
     log: Log | None = None,
 ) -> Grasp:
-    """What `physics.advance_grasp` gives in closed form."""
+    """Return the result that `physics.advance_grasp` has in closed form."""
     log = log if log is not None else Log()
     y, v, hand_y, hand_v, touching = now
     t, loose = 0.0, 0.0

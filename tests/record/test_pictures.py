@@ -18,7 +18,7 @@ from canwall.record.pictures import plot_run
 
 @pytest.fixture
 def copied(four_strikes: Record, tmp_path: Path) -> RunFolder:
-    """What the picture is drawn from, without the picture."""
+    """Copy of the files from which the picture is drawn, without the picture."""
     folder = RunFolder(tmp_path)
     shutil.copy(four_strikes.folder / "signals.parquet", folder.signals)
     shutil.copy(four_strikes.folder / "summary.json", folder.summary)

@@ -13,7 +13,7 @@ from canwall.run.closed_loop import ENABLING_CYCLES, simulate
 from canwall.walls import DEADBEAT, LAWS
 
 CYCLES = 4_000
-#: What the bus has besides: the state machine's words, and the clock.
+#: Columns that only a run on the bus has: words of the state machine, and timing.
 BESIDES = {"statusword", "controlword", "phase", *TIMING_COLUMNS}
 
 

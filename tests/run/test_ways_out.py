@@ -44,7 +44,7 @@ CHANGES = ON_A_BUSY_MACHINE | {
     "duration_s = 4.2\n": "",
 }
 
-#: What the dictionary has to lack for a watchdog to be the strongest, and its EMCY.
+#: Objects without which each watchdog is the strongest one left, and the code of its EMCY.
 WATCHDOGS = {
     "RPDO event timer": ((), 0x8250),
     "consumer heartbeat": (("1400sub5",), 0x8130),
@@ -68,7 +68,7 @@ class Witness(can.Listener):
         self.bus.shutdown()
 
     def torque_is_on(self) -> bool:
-        """Whether the latest RPDO has a torque."""
+        """Return True if the latest RPDO has a torque."""
         rpdos = [data for can_id, data in self.frames[-50:] if can_id == RPDO1]
         return bool(rpdos) and rpdo(rpdos[-1])[0] == ENABLE_OPERATION and rpdo(rpdos[-1])[1] != 0
 
@@ -227,7 +227,7 @@ def test_master_that_is_killed(start: Start, tmp_path: Path, watchdog: str, exch
 
 
 def complete(folder: Path) -> bool:
-    """Whether the writer is through: it has turned its stream into Parquet."""
+    """Return True once the writer has converted its stream to Parquet."""
     names = {path.name for path in folder.iterdir()}
     return (
         names >= {"bus.log", "signals.parquet"}

@@ -223,7 +223,7 @@ class Fuzzed(Bench):
                 self.tick(event)
 
     def answers_a_valid_request(self) -> bool:
-        """Whether the device type is read, from wherever LSS has put the node."""
+        """Return True if the device type can be read, whatever node-ID LSS has set."""
         self.tick(200.0)  # longer than any change of the bit timing
         self.give(*lss(4, 0))
         self.give(*lss(4, 1))

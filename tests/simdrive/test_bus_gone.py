@@ -15,7 +15,7 @@ _READ_STATUSWORD = bytes.fromhex("4041600000000000")
 
 
 class Interface(VirtualBus):
-    """What SocketCAN does while an interface is down, or its queue full."""
+    """Interface that may be down or have a full queue, with the errors of SocketCAN."""
 
     def __init__(self, channel: str) -> None:
         super().__init__(channel)

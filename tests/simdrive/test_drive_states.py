@@ -60,7 +60,7 @@ class Case(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """What there was when a SYNC was answered."""
+    """State of the drive when it answered a SYNC."""
 
     state: str
     speed: float

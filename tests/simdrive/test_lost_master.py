@@ -41,7 +41,7 @@ WATCHDOGS = {
 }
 """The object without which a dictionary does not offer it."""
 
-#: Which of them each dictionary offers, and whether it has the error behaviour.
+#: Those that each dictionary offers, and True if it has the error behaviour.
 OFFERED = {
     "canwall-drive.eds": ("rpdo heartbeat guarding sync", True),
     "maxon_epos4_0x1018.eds": ("heartbeat", True),

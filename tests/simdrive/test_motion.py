@@ -44,7 +44,7 @@ def torque_at(j: int) -> float:
 
 
 def least_jerk(hand: Hand, t: float) -> float:
-    """How far the hand has gone from rest to press in its one strike."""
+    """Return the share of the way from rest to press that the hand has gone in its one strike."""
     since = t - hand.first_strike_s
     leaving = hand.approach_s + hand.press_s
     if since < leaving:

@@ -1,4 +1,4 @@
-"""When PDOs are sent and taken: transmission types, inhibit time, event timers, lengths."""
+"""Transmission of PDOs: transmission types, inhibit time, event timers, lengths."""
 
 import struct
 

@@ -38,7 +38,7 @@ _PDO_COMMUNICATION = {
     0x6: {DEVICE_STATE, INVALID},  # SYNC start value
 }
 _PDO_MAPPING = {DEVICE_STATE, AbortCode.NO_OBJECT, AbortCode.NOT_MAPPABLE, AbortCode.TOO_HIGH}
-#: What a value that keeps to the limits of the EDS may still get, and why, by index.
+#: Abort codes for values within the limits of the EDS, by index, with the reason.
 SERVED: dict[int, set[AbortCode]] = {
     0x1003: {INVALID},  # 0 clears the history, no other number means anything
     0x1005: {INVALID},

@@ -19,7 +19,7 @@ from canwall.run import drive_dictionary, make_axis, make_exchange, on_the_bus, 
 from canwall.simdrive import SocketRunner
 
 CYCLES = 1200
-#: What the drive's end of a PDO, its state machine and SDO are for; PDOs are compared by rows.
+#: CAN-IDs of PDOs, which are compared by rows.
 PDOS = range(0x180, 0x580)
 
 

@@ -1,4 +1,4 @@
-"""What a SYNC does, and in which order; torque, its limits and the statusword bits on them."""
+"""Effects of a SYNC and their order; torque, its limits and their bits in the statusword."""
 
 import math
 import struct

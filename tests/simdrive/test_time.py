@@ -1,4 +1,4 @@
-"""When the torque of a PDO acts, and how time passes: against a free mass in closed form."""
+"""Delay of a PDO's torque and passage of time, compared with a free mass in closed form."""
 
 import itertools
 import struct

@@ -1,4 +1,4 @@
-"""What the sweep finds of spring and damper, against what is known of them (theory, section 6)."""
+"""Stability boundary of spring and damper in a sweep, compared with theory, section 6."""
 
 import math
 from typing import Any
@@ -48,7 +48,7 @@ def found(**axes: Any) -> xr.Dataset:
 
 
 def swings(dataset: xr.Dataset) -> Any:
-    """Whether the handle moves by more than a hundredth of how deep it is, at any phase."""
+    """Return True if the handle moves by more than 1 % of its penetration at any phase."""
     share = dataset["motion"] / dataset["penetration"]
     return (share > 0.01).any(("speed", "phase")).values.squeeze()
 
@@ -125,7 +125,7 @@ def test_passive_stiffness_solves_its_inequality(damping: float, delay: int) -> 
 
 
 def lasts(dataset: xr.Dataset) -> bool:
-    """Whether any wall goes on moving, or threw the handle away.
+    """Return True if any wall goes on moving, or threw the handle away.
 
     A passive one may rebound more often than its referent: it has its damping spent on K·T/2.
     """

@@ -1,4 +1,4 @@
-"""What ends a run is a fault, not a wall: strikes that end in no trip, at rates slow and fast."""
+"""No false trips: strikes on a faultless drive end without a trip, at slow and fast rates."""
 
 import pytest
 from rig import settings_with

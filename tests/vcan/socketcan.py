@@ -45,7 +45,7 @@ _SDO_REQUEST, _SDO_ANSWER, _STATUSWORD = 0x605, 0x585, b"\x40\x41\x60\x00\0\0\0\
 
 
 def has_socketcan() -> bool:
-    """Whether this kernel has PF_CAN."""
+    """Return True if this kernel has PF_CAN."""
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except OSError:
@@ -67,7 +67,7 @@ def wait_for(condition: Callable[[], bool]) -> None:
 
 
 def first_difference(one: Sequence[object], other: Sequence[object]) -> tuple[object, ...] | None:
-    """Where two sequences differ first, and how; of lengths, if in nothing else. None: they don't.
+    """Return the first difference of two sequences (else of their lengths), None if they are equal.
 
     pytest would lay thousands of frames side by side, for minutes.
     """
@@ -159,7 +159,7 @@ def light() -> Iterator[None]:
 
 
 class _ForkedWriter:
-    """What the record uses of a `subprocess.Popen` of its writer."""
+    """Stand-in for the `subprocess.Popen` of the writer, as far as the record uses it."""
 
     def __init__(self, command: list[str], **_: object) -> None:
         assert command[1:4] == ["-P", "-m", "canwall.record.writer"]
@@ -268,7 +268,7 @@ def statusword(bus: can.BusABC) -> int | None:
 
 
 def is_disabled(bus: can.BusABC) -> bool:
-    """Whether the drive says that it gives no torque."""
+    """Return True if the drive reports a state without torque."""
     word = statusword(bus)
     return word is not None and state_of(word) in (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
 

@@ -37,7 +37,7 @@ def _write_log(path: Path, frames: list[can.Message]) -> None:
 def test_replayed_master_gets_the_recorded_answers(
     strikes_by: Callable[[str], Strikes], tmp_path: Path
 ) -> None:
-    """What a drive answers depends on the frames alone: another one gives the same positions."""
+    """A drive's answers depend on the frames alone: another drive gives the same positions."""
     frames = strikes_by("native").record.frames
     syncs = [n for n, frame in enumerate(frames) if frame.arbitration_id == SYNC]
     one_strike = frames[: syncs[900]]

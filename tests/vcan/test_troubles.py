@@ -23,7 +23,7 @@ _SLOW = SLOW | UNTIL_STOPPED
 
 
 def _assert_told(run: Canwall, what: str) -> None:
-    """What failed, and what that means, in a line each."""
+    """Assert that the run reports what failed and what that means, in one line each."""
     assert run.wait() == 1
     failed, left = run.errors
     assert failed == f"canwall: the bus failed: {what}"

@@ -16,7 +16,7 @@ from canwall.workbench import Ball, sampled_ball
 
 @dataclass
 class Said:
-    """What one command came to."""
+    """Exit code and output of one command."""
 
     code: object
     out: str

@@ -37,7 +37,7 @@ NAMES = [
 
 @dataclass(frozen=True)
 class Written:
-    """What one `write_figures` left."""
+    """Results of one `write_figures`."""
 
     folder: Path
     index: str
@@ -52,7 +52,7 @@ class Written:
             return [row[header] for row in csv.DictReader(file)]
 
     def finding(self, name: str) -> str:
-        """What the index says of a figure's numbers."""
+        """Return the text of the index about a figure's numbers."""
         section = next(s for s in self.index.split("\n## ") if f"({name}.png)" in s)
         return section.partition("*Here:* ")[2]
 

@@ -1,4 +1,4 @@
-"""What happens to frames between the drive and the bus."""
+"""Faults of frames between the drive and the bus."""
 
 from collections.abc import Sequence
 
