@@ -18,22 +18,23 @@ from numpy.typing import NDArray
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
-#: One element of a structured array, e.g. `walls[0]`. In compiled code its fields are attributes
-#: and can be written; Python's type checkers know of no such thing, so it is Any to them.
+#: One element of a structured array, e.g. `walls[0]`. In compiled code its fields are writable
+#: attributes, which Python's type system cannot express; hence Any.
 Record: TypeAlias = Any
 
 
-#: Rooms without anything that compiled code elsewhere calls, lays out or has as a constant.
+#: Packages that compiled code elsewhere neither calls nor takes dtypes or constants from.
 _WITHOUT_COMPILED_CODE = ("bench", "cli", "config", "study", "sweep", "workbench")
 
 
 def _drop_stale_code() -> bool:
-    """Remove compiled code that was kept on disk before a source that it may depend on changed.
+    """Remove cached machine code that is older than a change of a source it may depend on.
 
-    Returns True if there is none of today's sources: this is a first start.
+    numba notices changes of the file that defines a function, but not of the files it calls into:
+    a law would go on using the estimator with which it was compiled.
 
-    numba sees a change of the file that a function stands in, not of those that it calls into: a
-    law would go on using the estimator of the day on which it was compiled.
+    Returns:
+        True at a first start, when nothing compiled from the present sources is in the cache.
     """
     package = Path(__file__).resolve().parent
     sources = sorted(
@@ -44,7 +45,7 @@ def _drop_stale_code() -> bool:
     states = [(str(s.relative_to(package)), s.stat().st_mtime_ns) for s in sources]
     digest = hashlib.sha256(repr(states).encode()).hexdigest()
     note = package / "__pycache__" / "sources.sha256"
-    with contextlib.suppress(OSError):  # an installation that may not be written keeps no code
+    with contextlib.suppress(OSError):  # a read-only installation has no cache
         if note.exists() and note.read_text() == digest:
             return False
         for kept in (*package.rglob("*.nbi"), *package.rglob("*.nbc")):
@@ -59,9 +60,9 @@ _first_start = _drop_stale_code()
 
 
 class _Compiling:
-    """The work of compiling in this process, and whom to tell when it gets long."""
+    """Compilation in this process, and the announcement of a long one."""
 
-    #: Seconds of compiling that go without a word.
+    #: Time of compiling that is not announced [s].
     SILENT_S = 1.0
 
     def __init__(self) -> None:
@@ -70,7 +71,7 @@ class _Compiling:
         self._spent_s = 0.0
 
     def note_miss(self) -> None:
-        """Note that a function is compiled now; a long first start has one after the other."""
+        """Note that a function is being compiled; a long first start compiles many in a row."""
         now_s = time.monotonic()
         self._spent_s += min(now_s - self._last_s, 0.3)
         self._last_s = now_s
@@ -83,7 +84,7 @@ _compiling = _Compiling()
 
 
 def announce_compiling(tell: Callable[[], None]) -> None:
-    """Have `tell` called, once, when what this process compiles takes more than a moment."""
+    """Have `tell` called once if compilation in this process takes more than a moment."""
     _compiling.tell = tell
 
 
@@ -91,9 +92,10 @@ _beside: list[subprocess.Popen[bytes]] = []
 
 
 def compile_beside(module: str, function: str) -> None:
-    """Let another process compile, at a first start, by calling the function of that module.
+    """At a first start, compile in another process by calling this function of this module there.
 
-    Nobody waits for it: what it has on disk in time is loaded, the rest is compiled here too.
+    Nothing waits for that process: code that it has cached in time is loaded, and the rest is
+    compiled here as well.
     """
     if _first_start and not _beside and (os.cpu_count() or 1) > 1:
         nowhere = subprocess.DEVNULL
@@ -104,11 +106,11 @@ def compile_beside(module: str, function: str) -> None:
 
 @functools.cache
 def _code_on_disk() -> Any:
-    """Numba's cache of machine code, which loads it without getting ready to compile.
+    """Return a variant of numba's cache that loads machine code without preparing to compile.
 
     numba fills its registries (and imports scipy.linalg for them) before it looks into the cache.
-    Loading needs none of that but the symbols of its runtime, and numba does it by itself before
-    it compiles: it is half of what a program with everything in the cache would wait for.
+    Loading needs only the symbols of its runtime, and numba fills the registries by itself before
+    it compiles. This halves the start of a program whose code is all in the cache.
     """
     from numba.core.caching import FunctionCache
     from numba.core.runtime import rtsys
@@ -133,11 +135,11 @@ def _code_on_disk() -> Any:
 
 
 class _Compiled:
-    """A function that is compiled when it is first called, by Python or by compiled code.
+    """A function that is compiled at its first call, from Python or from compiled code.
 
-    numba takes long to import; whoever merely imports a module with such a function in it does
-    not wait for that. For compiled code it is compiled apart, without what Python calls it by,
-    and once for all constants that it is called with: either saves a fifth of a first start.
+    numba takes long to import; merely importing a module with such a function does not wait for
+    it. For compiled callers the function is compiled separately, without the wrapper for Python,
+    and once for all constant arguments: each saves a fifth of a first start.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -148,7 +150,7 @@ class _Compiled:
         return self._for_python(*args, **kwargs)
 
     def compile(self, *examples: Any) -> None:
-        """Compile for a call with arguments of the types of these, without calling."""
+        """Compile for arguments of the types of `examples`, without a call."""
         from numba import typeof
 
         self._for_python.compile(tuple(typeof(example) for example in examples))
@@ -188,17 +190,25 @@ class _Compiled:
 
 
 def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Compile with numba: kept on disk, free of the interpreter lock, division as in IEEE 754."""
+    """Compile with numba: cached on disk, without the interpreter lock, with IEEE 754 division."""
     result: Any = _Compiled(function)
     return result
 
 
 def compiled_for_c(function: Callable[..., Any], signature: Any, kept: bool = True) -> Any:
-    """Compile a function that others call by its address, e.g. compiled code from a record.
+    """Compile a function to be called by its address, e.g. from a record by compiled code.
 
-    `signature` is numba's. `kept` keeps the code on disk, for functions of this package only: of
-    others nobody sees when what they call changes. Returns numba's CFunc, with `address`, which
-    the code lives as long as. Raises numba's NumbaError where it does not compile.
+    Args:
+        function: The function.
+        signature: Its signature, as numba's.
+        kept: Cache the code on disk. For functions of this package only: nothing tracks changes of
+            what other functions call.
+
+    Returns:
+        numba's CFunc, with `address`; the code lives as long as this object.
+
+    Raises:
+        NumbaError: If the function does not compile.
     """
     from numba.core.ccallback import CFunc
     from numba.core.sigutils import normalize_signature
@@ -211,27 +221,31 @@ def compiled_for_c(function: Callable[..., Any], signature: Any, kept: bool = Tr
 
 
 def copied(record: NDArray[np.void]) -> NDArray[np.void]:
-    """A copy of a contiguous record, as bytes: numpy goes field by field, and keeps the lock."""
+    """Return a copy of a contiguous record, copied as bytes.
+
+    NumPy would copy field by field and hold the interpreter lock.
+    """
     return record.view(np.uint8).copy().view(record.dtype)
 
 
 def fields(record: NDArray[np.void]) -> Record:
-    """Return the element of a record of shape (1,), its fields as attributes in Python as well.
+    """Return the element of a record of shape (1,), with its fields as attributes in Python too.
 
-    They are the record's own memory, read and written at a tenth of what numpy takes.
+    The attributes access the record's own memory, in a tenth of the time that NumPy takes.
     """
     structure: Any = np.ctypeslib.as_ctypes_type(record.dtype)  # type: ignore[arg-type]
     return structure.from_buffer(record)
 
 
 def data_to_number(data: bytes | bytearray) -> int:
-    """Data of a CAN frame as the 64-bit number that compiled code works on.
+    """Return the data of a CAN frame as the 64-bit number that compiled code works on.
 
-    Little-endian, missing bytes zero; signed, because that is what a Python int becomes there.
+    The number is little-endian with missing bytes zero, and signed, as a Python int is in compiled
+    code.
     """
     return int.from_bytes(data.ljust(8, b"\0"), "little", signed=True)
 
 
 def number_to_data(number: int, length: int) -> bytes:
-    """The first `length` bytes that such a number stands for."""
+    """Return the first `length` bytes of the data that such a number stands for."""
     return number.to_bytes(8, "little", signed=True)[:length]

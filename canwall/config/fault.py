@@ -16,8 +16,8 @@ def _one_of_the_kinds(source: Any, handler: Any) -> core_schema.CoreSchema:
 class Fault(Section):
     """One fault: its kind, its begin and duration, and what it touches.
 
-    Without at_s and at_sync it is there from power-on; without a duration it stays (`reboot`
-    is over at once). docs/faults.md has the kinds and their amounts.
+    Without at_s and at_sync it is present from power-on; without a duration it stays (`reboot`
+    ends at once). docs/faults.md lists the kinds and their amounts.
     """
 
     kind: Annotated[str, GetPydanticSchema(_one_of_the_kinds)]

@@ -110,5 +110,5 @@ class Hand(Section):
 
     @property
     def side(self) -> float:
-        """Direction in which it presses: 1.0 or -1.0."""
+        """Direction in which the hand presses, 1.0 or -1.0."""
         return 1.0 if self.press_rad > self.rest_rad else -1.0

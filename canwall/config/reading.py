@@ -1,4 +1,4 @@
-"""Reading of a configuration: from the file to settings, or to one line about its first error."""
+"""Reading of a configuration: from a file to settings, or to one line about the first error."""
 
 import difflib
 import math
@@ -12,8 +12,8 @@ from pydantic import BaseModel, ValidationError
 from canwall.config.settings import Settings
 from canwall.errors import ConfigError
 
-# [wall] may be written with lengths and forces at a handle of radius r instead of angles and
-# torques at its shaft: the metric key, its angular one, and the exponent of r between them.
+# [wall] may be given in lengths and forces at a handle of radius r instead of angles and torques
+# at its shaft. Each entry: metric key, angular key, and the exponent of r between them.
 _METRIC_KEYS = {
     "position_m": ("position_rad", -1),
     "stiffness_n_per_m": ("stiffness_nm_per_rad", 2),
@@ -22,7 +22,7 @@ _METRIC_KEYS = {
 
 
 def _convert_metric_keys(raw: dict[str, Any]) -> None:
-    """Convert metric keys to angular ones; values of a wrong type are left to the validation."""
+    """Convert metric keys to angular ones; leave values of a wrong type to the validation."""
     mechanics, schedule = raw.get("mechanics"), raw.get("schedule")
     radius = mechanics.get("handle_radius_m") if isinstance(mechanics, dict) else None
     if not isinstance(radius, int | float) or not radius > 0:
@@ -133,7 +133,7 @@ def absolute_law(law: str, base: Path) -> str:
     return f"{(base / path).resolve()}:{function}" if colon else law
 
 
-# Types as TOML calls them, by the errors in which pydantic names those of Python.
+# Names of types in TOML, by the pydantic errors that use Python's names.
 _TOML_TYPES = {
     "model_type": "a table",
     "dict_type": "a table",
@@ -182,7 +182,7 @@ def _suggestion(where: list[str], model: Any) -> str:
 
 
 def shipped(relative: str) -> Path:
-    """Return the path of a file of the project, e.g. `config/sim.toml`, installed or not."""
+    """Return the path of a file that ships with the project, e.g. `config/sim.toml`."""
     package = Path(__file__).resolve().parents[1]
     installed = package / "data" / relative
     return installed if installed.exists() else package.parent / relative

@@ -1,4 +1,4 @@
-"""Base of every section of a configuration, and the types that TOML writes in its own way."""
+"""Base class of all sections of a configuration, and types that TOML represents differently."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -16,7 +16,7 @@ from pydantic import (
 
 
 class Section(BaseModel):
-    """One table of the file: immutable, without unknown keys, its numbers finite."""
+    """One table of the file: immutable, without unknown keys, and with finite numbers."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
@@ -25,7 +25,7 @@ class Change(Section):
     """New values for some keys of a section; None leaves a key as it is."""
 
     if TYPE_CHECKING:
-        # `changing` adds the keys when the program runs: a type checker does not see them.
+        # `changing` adds the keys at run time, so a type checker does not see them.
         def __getattr__(self, key: str) -> Any: ...
 
 
@@ -33,14 +33,14 @@ _C = TypeVar("_C", bound=Change)
 
 
 def changing(section: type[Section], keys: Iterable[str]) -> Callable[[type[_C]], type[_C]]:
-    """Give a class of changes these keys of a section, so that each is declared once, there.
+    """Add these keys of a section to a class of changes, so that each key is declared only once.
 
-    Types and bounds are those of the section; its own validators do not come with them.
+    Types and bounds are those of the section; its validators are not inherited.
     """
     optional: dict[str, Any] = {}
     for key in keys:
         field = section.model_fields[key]
-        # Annotated wants one annotation at least: an empty one stands before the bounds.
+        # Annotated needs at least one annotation, so an empty one precedes the bounds.
         optional[key] = (Annotated[field.annotation, Field(), *field.metadata] | None, None)
 
     def with_keys(change: type[_C]) -> type[_C]:

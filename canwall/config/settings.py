@@ -20,7 +20,7 @@ from canwall.config.sweep import AxisValues
 
 
 class Bus(Section):
-    """`[bus]`: the interface to the drive, the period of the SYNC and who sends it."""
+    """`[bus]`: the interface to the drive, and the period and the producer of the SYNC."""
 
     interface: str = "virtual"
     channel: str = "canwall"
@@ -67,8 +67,8 @@ class Estimator(Section):
         force_walk_nm_per_sqrt_s: Random walk of the operator's force.
         delay_cycles: Delay D from the sampling of a position until the torque computed from it
             takes effect, in cycles. Default: 1 with synchronous PDOs; measured with others.
-        measure_delay: Measure the delay in any case, before the wall is rendered.
-        measure_torque_nm: Amplitude of the small torques by which it is measured.
+        measure_delay: Always measure the delay before the wall is rendered.
+        measure_torque_nm: Amplitude of the small torques of the measurement.
         measure_cycles: Duration of the measurement.
     """
 
@@ -80,17 +80,17 @@ class Estimator(Section):
 
 
 class Limits(Section):
-    """`[limits]`: torque and its rate are clipped; the run ends where another limit is exceeded.
+    """`[limits]`: torque and torque rate are clipped; any other limit, if exceeded, ends the run.
 
     Attributes:
-        jump_rad: Largest distance of a position from the expected one. Default: as far as
-            speed_rad_s goes in a cycle.
-        stuck_rad: Distance that the handle is expected to move within stuck_cycles while the
-            position stays the same to the count; 0: not watched.
-        torque_error_nm: Largest distance of 0x6077, for torque_error_cycles, from all torques
-            commanded recently. Default: a tenth of torque_nm, and no less than 5 % of the rated
-            torque; 0: not watched.
-        late_cycles: RPDOs in a row that come after the next SYNC, in real time; 0: only counted.
+        jump_rad: Largest distance of a position from the expected one. Default: the travel in
+            one cycle at speed_rad_s.
+        stuck_rad: Travel that the model predicts within stuck_cycles while the position does not
+            change by a single count; 0: not monitored.
+        torque_error_nm: Largest deviation of 0x6077, for torque_error_cycles, from all recently
+            commanded torques. Default: a tenth of torque_nm, but at least 5 % of the rated
+            torque; 0: not monitored.
+        late_cycles: Consecutive RPDOs sent after the next SYNC, in real time; 0: only counted.
     """
 
     torque_nm: Positive
@@ -122,7 +122,7 @@ class Limits(Section):
 
 
 class Run(Section):
-    """`[run]`: duration, times over which walls come in and change, format of the bus log."""
+    """`[run]`: duration, times over which walls fade in and change, format of the bus log."""
 
     duration_s: Positive | None = None
     ramp_in_s: NonNegative = 0.5
@@ -138,7 +138,7 @@ class LimitsChange(Change):
 
 @changing(Wall, (key for key in Wall.model_fields if key not in ("side", "alternate")))
 class _WallKeys(Change):
-    """Changes of `[wall]`: of all its keys but the side and the laws that take turns."""
+    """Changes of `[wall]`: all keys except the side and the alternating laws."""
 
 
 class WallChange(_WallKeys):
@@ -150,7 +150,7 @@ class WallChange(_WallKeys):
         """Return wall and limits after the change."""
         update = self.model_dump(exclude={"at_s", "limits"}, exclude_none=True)
         if self.law is not None:
-            update.setdefault("options", {})  # they were the other law's
+            update.setdefault("options", {})  # options belong to the previous law
         if self.limits is not None:
             limits = limits.model_copy(update=self.limits.model_dump(exclude_none=True))
         return wall.model_copy(update=update), limits
@@ -171,7 +171,7 @@ class Stage(NamedTuple):
 
 
 class Settings(Section):
-    """Everything that one run needs to know."""
+    """Complete settings of one run."""
 
     bus: Bus = Bus()
     drive: Drive
@@ -212,32 +212,32 @@ class Settings(Section):
 
     @property
     def stages(self) -> list[Stage]:
-        """Wall and limits, each with the time from which they are in force; the first from 0."""
+        """Walls and limits with the times from which they are in force; the first time is 0."""
         timeline = [Stage(0.0, self.wall, self.limits)]
         for change in self.schedule:
             timeline.append(Stage(change.at_s, *change.applied_to(*timeline[-1][1:])))
         return timeline
 
     def laws_in_turn(self, wall: Wall) -> list[Wall]:
-        """Return the walls that take turns from strike to strike: `wall`, then its `alternate`.
+        """Return the walls that alternate from strike to strike, `wall` first.
 
-        Options belong to a law: the others have their defaults.
+        Options belong to the law of `wall`; the laws in `alternate` have their defaults.
         """
         others = [wall.model_copy(update={"law": law, "options": {}}) for law in wall.alternate]
         return [wall, *others]
 
     @property
     def embedded(self) -> bool:
-        """True if the simulated drive lives in the process of the master.
+        """True if the simulated drive runs in the process of the master.
 
-        python-can's virtual bus ends at the process; on every other bus the simulated drive is a
-        process of its own (`canwall drive`).
+        python-can's virtual bus does not leave the process; on every other bus the simulated drive
+        is a process of its own (`canwall drive`).
         """
         return self.simulation is not None and self.bus.interface == "virtual"
 
     @property
     def real_time(self) -> bool:
-        """True if SYNCs keep to the clock; else they go out as fast as the simulation answers."""
+        """True if SYNCs follow the clock, False if they go as fast as the simulation answers."""
         if self.bus.pace == "auto":
             return self.simulation is None or self.simulation.real_time
         return self.bus.pace == "real_time"

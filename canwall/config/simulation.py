@@ -14,20 +14,20 @@ class Simulation(Section):
     """`[simulation]`: the mechanics of the simulated drive, and the hand on its handle.
 
     `objects` are power-on values that override those of the dictionary. Rated torque and encoder
-    are those of the dictionary (0x6076, 0x608F); the keys are for a dictionary without them. The
+    come from the dictionary (0x6076, 0x608F); the keys are for a dictionary without them. The
     motor's torque is limited to `peak_torque_nm` (by default three times the rated torque), and
-    falls back to the rated torque after `overload_s` at the peak or longer below it (I²t). The
+    falls back to the rated torque after `overload_s` at the peak, or longer below it (I²t). The
     limit switches are closed outside `limit_switches_rad`, the home switch within
     `home_switch_rad`. Parameters stored through 0x1010 are kept in the file `store`, if given.
 
-    The motor cogs with a triangle wave of amplitude `cogging_nm`, `cogs_per_rev` times a
-    revolution. Its current loop is a first-order lag of `current_bandwidth_hz` (0: no lag) with a
-    resolution of `torque_step_nm` (0: exact). The velocity (0x606C) is the difference of the
-    encoder over one period, low-pass filtered with `velocity_filter_hz` (0: unfiltered).
+    The motor's cogging torque is a triangle wave of amplitude `cogging_nm`, with `cogs_per_rev`
+    periods per revolution. The current loop is a first-order lag of `current_bandwidth_hz` (0: no
+    lag) with a resolution of `torque_step_nm` (0: exact). The velocity (0x606C) is the difference
+    of the encoder over one period, low-pass filtered with `velocity_filter_hz` (0: unfiltered).
 
     Time advances by one `[bus] cycle_s` per SYNC or, with `real_time`, by the clock. The torque of
     an RPDO acts `torque_delay_cycles` periods after the SYNC (synchronous types) or after its
-    arrival (254, 255). `seed` is that of the faults.
+    arrival (254, 255). `seed` seeds the random numbers of the faults.
     """
 
     objects: Objects = Field(default_factory=dict)
@@ -55,10 +55,10 @@ class Simulation(Section):
 
     @property
     def objects_by_index(self) -> dict[tuple[int, int], int]:
-        """`objects` by index and sub-index."""
+        """Return `objects` by index and sub-index."""
         return by_index(self.objects)
 
     def with_ideal_servo(self) -> Self:
-        """Return the same mechanics with a motor without cogging, torque steps and lag."""
+        """Return the same mechanics without cogging, torque steps and lag of the motor."""
         ideal = {"cogging_nm": 0.0, "torque_step_nm": 0.0, "current_bandwidth_hz": 0.0}
         return self.model_copy(update=ideal)
