@@ -1,7 +1,7 @@
 """Record of a run: one row per cycle, every frame, and a summary.
 
-The cycle writes into a ring in shared memory and never waits for a disk; a process of its own
-(`writer`) empties the ring into the run's folder, and completes the files even if the master dies.
+The cycle writes into a ring in shared memory and never waits for a disk. A separate process
+(`writer`) empties the ring into the run's folder and completes the files even if the master dies.
 """
 
 from canwall.record.columns import ROW, TIMING_COLUMNS, Phase, column_table

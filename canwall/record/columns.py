@@ -1,8 +1,8 @@
 """Columns of a run's record, each declared once.
 
 The row that the cycle fills (`ROW`), the schema of signals.parquet with units and meanings as
-metadata, and the table of the documentation all come from `COLUMNS`. A new column is a line there
-and the line in the cycle that fills it.
+metadata, and the table in the documentation all come from `COLUMNS`. A new column needs one line
+there and one line in the cycle that fills it.
 """
 
 import json
@@ -31,11 +31,11 @@ class Column(NamedTuple):
 
     Attributes:
         name: Name in a row and in the files.
-        dtype: NumPy's type of it in a row.
-        unit: Unit, empty where there is none.
+        dtype: NumPy type in a row.
+        unit: Unit, empty if there is none.
         meaning: One line for the metadata and the documentation.
-        names_law: The row holds an index into the laws of the run, the files hold the law's name.
-        by_clock: Decided by the clock of the machine; all others are the same from run to run.
+        names_law: Rows hold an index into the laws of the run; the files hold the law's name.
+        by_clock: The values depend on the clock; those of other columns are reproducible.
     """
 
     name: str
@@ -48,8 +48,8 @@ class Column(NamedTuple):
 
 _PHASES = ", ".join(f"{phase.value} {phase.name.lower()}" for phase in Phase)
 
-#: One cycle. `position_rad` and what is called torque have the sign of the drive's axis; y, v, d,
-#: force and stiffness are the wall's: y < 0 inside it, force > 0 out of it.
+#: Columns of one cycle. `position_rad` and torques have the sign of the drive's axis; y, v, d,
+#: force and stiffness have that of the wall: y < 0 inside it, force > 0 out of it.
 COLUMNS = (
     Column("j", "i8", "", "SYNC count, from 0"),
     Column("t_s", "f8", "s", "nominal time of the SYNC: j times the cycle"),
@@ -77,15 +77,15 @@ COLUMNS = (
     Column("latency_s", "f8", "s", "time from reception of the TPDO to the RPDO", by_clock=True),
 )
 
-#: One cycle as the cycle fills it and as the ring carries it.
+#: Row of one cycle, in the cycle and in the ring.
 ROW = np.dtype([(column.name, column.dtype) for column in COLUMNS], align=True)
 
-#: Columns that the clock of the machine decides; all others are the same from run to run.
+#: Columns that depend on the clock; all others are reproducible.
 TIMING_COLUMNS = tuple(column.name for column in COLUMNS if column.by_clock)
 
 
 def column_table() -> str:
-    """The columns as a Markdown table, for the documentation."""
+    """Return the columns as a Markdown table, for the documentation."""
     lines = ["| column | type | unit | meaning |", "|---|---|---|---|"]
     for column in COLUMNS:
         kind = "string" if column.names_law else np.dtype(column.dtype).name
@@ -94,9 +94,9 @@ def column_table() -> str:
 
 
 def schema(laws: Sequence[str]) -> "pa.Schema":
-    """Schema of signals.parquet for a run with these laws.
+    """Return the schema of signals.parquet for a run with these laws.
 
-    A field's metadata are `unit` and `description`; the schema's are `laws`, as JSON.
+    The metadata of a field are `unit` and `description`; those of the schema are `laws`, as JSON.
     """
     import pyarrow as pa
 
@@ -114,9 +114,9 @@ def schema(laws: Sequence[str]) -> "pa.Schema":
 
 
 def record_batch(rows: NDArray[np.void], laws: Sequence[str]) -> "pa.RecordBatch":
-    """Rows of dtype ROW, shape (n,), as Arrow has them.
+    """Return rows (dtype ROW, shape (n,)) as an Arrow record batch.
 
-    Made from their bytes, because `pyarrow.array` imports pandas to look at what it is given.
+    It is made from their bytes, because `pyarrow.array` imports pandas to inspect its argument.
     """
     import pyarrow as pa
 

@@ -1,4 +1,4 @@
-"""A run's folder: its files by name, and reading them back."""
+"""Folder of a run: names of its files, and functions to read them."""
 
 import contextlib
 import json
@@ -16,7 +16,7 @@ from canwall.errors import ConfigError
 if TYPE_CHECKING:
     import pyarrow as pa
 
-#: Cycles that are kept of the time before a trip.
+#: Cycles before a trip that are kept.
 _TRIP_CYCLES = 200
 
 
@@ -26,13 +26,13 @@ def stream_of(signals: Path) -> Path:
 
 
 def read_signals(path: Path, columns: Collection[str] = ("j",)) -> "pa.Table":
-    """Read signals.parquet as a table; of a run that was cut off, what its stream has.
+    """Read signals.parquet as a table, or the stream of a run that was cut off.
 
-    The table has the columns that the record has: one of another version may lack some or have
-    more. `columns` are those that the caller cannot do without.
+    The table has all columns of the record, which another version may have written: some may be
+    missing and others added. `columns` are those that the caller requires.
 
     Raises:
-        ConfigError: The file is missing, not readable, or lacks one of `columns`.
+        ConfigError: If the file is missing, not readable, or lacks one of `columns`.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -55,16 +55,16 @@ def read_signals(path: Path, columns: Collection[str] = ("j",)) -> "pa.Table":
 
 
 def numbers(signals: "pa.Table", name: str) -> NDArray[Any]:
-    """A column of numbers as an array, shape (n,).
+    """Return a column of numbers as an array, shape (n,).
 
-    As pyarrow's own `to_numpy`, which imports pandas first; that takes longer than a short run.
+    pyarrow's `to_numpy` would import pandas first, which takes longer than a short run.
     """
     chunks = [np.from_dlpack(chunk) for chunk in signals[name].chunks]
     return np.concatenate(chunks) if chunks else np.empty(0)
 
 
 def _read_stream(path: Path) -> "pa.Table":
-    """The batches of a stream up to the one that was not written to its end."""
+    """Return the batches of a stream up to the first incomplete one."""
     import pyarrow as pa
 
     with path.open("rb") as file, pa.ipc.open_stream(file) as stream:
@@ -82,9 +82,9 @@ class RunFolder:
 
     @classmethod
     def create(cls, path: Path | None) -> "RunFolder":
-        """A new folder; with no path, `runs/<date and time>` under the current directory.
+        """Create a folder, by default `runs/<date and time>` under the current directory.
 
-        Raises ConfigError where the folder cannot be made or holds a run already.
+        Raises ConfigError if the folder cannot be created or already holds a run.
         """
         path = path or cls.default_path()
         folder = cls(path)
@@ -103,7 +103,7 @@ class RunFolder:
 
     @staticmethod
     def default_path() -> Path:
-        """`runs/<date and time>` under the current directory."""
+        """Return `runs/<date and time>` under the current directory."""
         return Path("runs") / datetime.now().strftime("%Y-%m-%d_%H-%M-%S_%f")
 
     @property
@@ -137,7 +137,7 @@ class RunFolder:
         return self.path / "trip.csv"
 
     def write_trip(self, signals: "pa.Table", cycle: int) -> None:
-        """Keep the cycles up to the one that tripped. Shows them in the order of j."""
+        """Write the cycles up to the one that tripped, in the order of j."""
         import pyarrow.csv as pa_csv
 
         end = int(np.searchsorted(numbers(signals, "j"), cycle, side="right"))
@@ -146,7 +146,7 @@ class RunFolder:
         )
 
     def read_summary(self) -> dict[str, Any]:
-        """summary.json. Raises ConfigError where it is missing or not JSON."""
+        """Read summary.json. Raises ConfigError if it is missing or not JSON."""
         try:
             content: dict[str, Any] = json.loads(self.summary.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:

@@ -1,7 +1,7 @@
-"""Changes of a wall that is being rendered, from another process: one at a time, in shared memory.
+"""Changes of a wall during a run, posted by another process one at a time in shared memory.
 
-A change is a text that the sender has checked. The loop looks for one between two cycles, takes
-it whole, and says at which cycle; nobody waits for the other but the sender for that answer.
+A change is a text that the sender has checked. The loop looks for one between two cycles, takes it
+as a whole, and notes the cycle. The loop never waits; the sender waits for that note.
 """
 
 import fcntl
@@ -11,7 +11,7 @@ import time
 
 import numpy as np
 
-#: Both counters count changes: posted by senders, taken by the loop; at: the cycle of the last.
+#: Changes posted by senders, changes taken by the loop, the cycle of the last one, its length.
 _HEADER = np.dtype([("posted", "i8"), ("taken", "i8"), ("at", "i8"), ("length", "i8")], align=True)
 _TEXT = 4096
 _SIZE = _HEADER.itemsize + _TEXT
@@ -19,7 +19,7 @@ _POLL_S = 0.001
 
 
 class Mailbox:
-    """One piece of shared memory with room for one change."""
+    """A block of shared memory with room for one change."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
@@ -29,14 +29,14 @@ class Mailbox:
 
     @classmethod
     def create(cls) -> "Mailbox":
-        """A new, empty mailbox."""
+        """Create an empty mailbox."""
         descriptor = os.memfd_create("canwall-mailbox")
         os.ftruncate(descriptor, _SIZE)
         return cls(descriptor)
 
     @classmethod
     def open(cls, address: str) -> "Mailbox":
-        """The mailbox of another process. Raises OSError where it is gone."""
+        """Open the mailbox of another process. Raises OSError if it no longer exists."""
         return cls(os.open(address, os.O_RDWR))
 
     @property
@@ -45,15 +45,15 @@ class Mailbox:
         return f"/proc/{os.getpid()}/fd/{self._descriptor}"
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the mailbox in this process."""
         os.close(self._descriptor)
 
     def waiting(self) -> bool:
-        """Loop: whether there is a change to be taken."""
+        """Return True if a change is waiting; called by the loop."""
         return bool(self._posted[0] != self._taken[0])
 
     def take(self, cycle: int) -> str:
-        """Loop: the change that is waiting, which is in force from this cycle on."""
+        """Return the waiting change, in force from this cycle on; called by the loop."""
         length = int(self._header["length"][0])
         text = self._memory[_HEADER.itemsize : _HEADER.itemsize + length].decode()
         self._header["at"] = cycle
@@ -61,15 +61,16 @@ class Mailbox:
         return text
 
     def post(self, text: str, timeout_s: float) -> int:
-        """Sender: post a change, wait until it was taken; the cycle from which on it is in force.
+        """Post a change and wait until it is taken; called by the sender.
 
-        Raises ValueError for a text that is too long, TimeoutError where nobody takes it.
+        Returns the cycle from which on it is in force. Raises ValueError for a text that is too
+        long, TimeoutError if the loop does not take it in time.
         """
         data = text.encode()
         if len(data) > _TEXT:
             raise ValueError(f"a change of {len(data)} bytes; {_TEXT} is the most")
         deadline = time.monotonic() + timeout_s
-        # One sender at a time; the lock goes with the process that holds it.
+        # One sender at a time; the lock is released when its holder dies.
         fcntl.flock(self._descriptor, fcntl.LOCK_EX)
         try:
             while self.waiting():

@@ -1,4 +1,4 @@
-"""The picture of a run, drawn from its record alone."""
+"""Picture of a run, drawn from its record alone."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,18 +20,20 @@ Array = NDArray[np.float64]
 
 #: Length of a close-up [s].
 _CLOSE_UP_S = 0.045
-#: Columns of the record that are drawn.
+#: Columns of the record that the picture needs.
 _DRAWN = ("t_s", "y", "torque_applied", "force_applied")
-#: No title here has to make way for ticks, so none looks for them: a command waits for its picture.
+#: Fixed title positions: no title here has to avoid ticks, and looking for them takes time.
 _QUICK = {"axes.titley": 1.0}
 
 
 def plot_run(folder: RunFolder) -> Path:
-    """The run at a glance, into run.png; returns its path.
+    """Draw the run into run.png and return its path.
 
-    Position and torque over time with the strikes marked, one contact of each law close up
-    (Figure 5.19 of the source), and force over position (Figure 5.3). Raises ConfigError where
-    the folder holds no record.
+    The picture shows position and torque over time with the strikes marked, a close-up of one
+    contact of each law (Figure 5.19 of the source), and force over position (Figure 5.3).
+
+    Raises:
+        ConfigError: If the folder holds no record.
     """
     signals, summary = read_signals(folder.signals, _DRAWN), folder.read_summary()
     strikes = summary["strikes"]
@@ -49,7 +51,7 @@ def plot_run(folder: RunFolder) -> Path:
         for column, strike in enumerate(shown):
             _close_up(figure.add_subplot(details[column]), signals, strike, colours)
         _force_over_position(figure.add_subplot(details[-1]), signals, shown, colours)
-        # Figure.savefig would draw everything twice, the first time for the layout alone.
+        # Figure.savefig would draw everything twice, first only for the layout.
         canvas = FigureCanvasAgg(figure)
         quick = {"compress_level": 1}
         canvas.print_png(folder.picture, pil_kwargs=quick)  # type: ignore[no-untyped-call]
@@ -66,7 +68,7 @@ def _mark_strikes(axes: Axes, strikes: list[dict[str, Any]], colours: dict[str, 
 def draw_strikes(
     axes: Axes, signals: "pa.Table", strikes: list[dict[str, Any]], colours: dict[str, str]
 ) -> None:
-    """Position [mrad] over time, each strike of the summary with its law and whether it chatters.
+    """Draw position [mrad] over time, and mark each strike with its law and any chatter.
 
     colours maps each law to its colour.
     """
@@ -139,7 +141,7 @@ def _force_over_position(
     deepest = 0.0
     for strike in shown:
         window = (t >= strike["start_s"]) & (t <= strike["start_s"] + _CLOSE_UP_S)
-        # Held over each period: along y at constant force, then the step to the next.
+        # The force is held over each period: along y at constant force, then a step to the next.
         axes.plot(
             np.repeat(y[window], 2)[1:],
             np.repeat(force[window], 2)[:-1],

@@ -1,4 +1,4 @@
-"""The master's end of the record: starts the writer, tells it what to do, and ends it."""
+"""Master's end of the record: it starts, commands and ends the writer."""
 
 import contextlib
 import json
@@ -19,15 +19,14 @@ _TIMEOUT_S = 60.0
 
 
 class RecordError(RunFailedError):
-    """A record that could not be written."""
+    """Failure to write a record."""
 
 
 class Recorder:
-    """A run's record in the making.
+    """Record of a run in progress; a context manager, which ends the writer.
 
-    The writer, a process of its own, empties `ring` into the run's folder. It takes some tenths of
-    a second to start: a recorder that is made early starts it beside other work. A context: at its
-    end the writer ends.
+    The writer, a separate process, empties `ring` into the run's folder. It takes some tenths of a
+    second to start, so a recorder should be made early, ahead of other work.
     """
 
     def __init__(self) -> None:
@@ -42,7 +41,7 @@ class Recorder:
                 stdout=subprocess.PIPE,
                 bufsize=0,
                 pass_fds=[self.ring.descriptor],
-                start_new_session=True,  # Ctrl-C is meant for the master, who ends the writer
+                start_new_session=True,  # Ctrl-C is for the master, which ends the writer
             )
         except OSError as error:
             raise RecordError(f"the writer of the record does not start: {error}") from None
@@ -53,18 +52,18 @@ class Recorder:
     def __exit__(self, *exc_info: object) -> None:
         if not self._begun:
             self._writer.kill()  # it may still be starting
-        with self._writer:  # closes the pipes, which ends it, and waits
+        with self._writer:  # closes the pipes, which ends the writer, and waits for it
             pass
         self.ring.close()
 
     def begin(self, folder: Path, bus_log: str, channel: str, laws: Sequence[str]) -> None:
-        """Record into an existing folder from now on; an empty `bus_log`: without the frames."""
+        """Begin to record into an existing folder, without frames if `bus_log` is empty."""
         self.folder = folder
         self._begun = True
         self._tell(folder=str(folder), bus_log=bus_log, channel=channel, laws=list(laws))
 
     def close(self) -> list[str]:
-        """Complete the files. Returns what a reader of the record has to know, a line each."""
+        """Complete the files. Returns remarks for readers of the record, one line each."""
         self._tell(close=True)
         error = self._answer()
         header = self.ring.header[0]
@@ -76,14 +75,14 @@ class Recorder:
         return notes
 
     def draw(self) -> list[str]:
-        """Draw run.png once the summary is written. Returns what went wrong, a line each."""
+        """Draw run.png once the summary is written. Returns errors, one line each."""
         self._tell(draw=True)
         error = self._answer()
         return [f"{self.folder}: the picture is missing: {error}"] if error else []
 
     def _tell(self, **order: Any) -> None:
         assert self._writer.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # a writer that has died does not answer either
+        with contextlib.suppress(BrokenPipeError):  # `_answer` notices a writer that has died
             self._writer.stdin.write(json.dumps(order).encode() + b"\n")
 
     def _answer(self) -> str:
@@ -104,6 +103,6 @@ class Recorder:
 
 @contextlib.contextmanager
 def start_recorders(count: int) -> Iterator[list[Recorder]]:
-    """Recorders for so many drives; they end with the context. Raises RecordError."""
+    """Start a recorder for each of `count` drives, for the context. Raises RecordError."""
     with contextlib.ExitStack() as stack:
         yield [stack.enter_context(Recorder()) for _ in range(count)]

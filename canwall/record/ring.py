@@ -1,7 +1,7 @@
-"""The ring in shared memory that carries the rows and frames of a run to the writer.
+"""Ring buffers in shared memory that carry the rows and frames of a run to the writer.
 
-One writer and one reader for each of the two rings (cycles and frames). Each side owns one
-counter: the head counts what was put in, the tail what was taken out; neither ever runs back.
+Each of the two rings (cycles and frames) has one producer and one consumer, and each side owns one
+counter: the head counts the items put in, the tail the items taken out. Neither is ever reset.
 """
 
 import mmap
@@ -17,7 +17,7 @@ from canwall.record.columns import ROW
 #: Bits of a FRAME's flags.
 RECEIVED, REMOTE, ERROR, EXTENDED = 1, 2, 4, 8
 
-#: One frame on the bus, as the master saw or sent it.
+#: One frame on the bus, as the master received or sent it.
 FRAME = np.dtype(
     [
         ("time_s", "f8"),
@@ -29,7 +29,7 @@ FRAME = np.dtype(
     align=True,
 )
 
-#: Heads and tails of both rings, and what they had no room for.
+#: Heads and tails of both rings, and the numbers of lost items.
 HEADER = np.dtype(
     [
         ("row_head", "i8"),
@@ -42,13 +42,13 @@ HEADER = np.dtype(
     align=True,
 )
 
-#: Capacity in cycles and frames: 16 s at 1 kHz, longer than a disk usually sulks.
+#: Capacity in cycles and frames: 16 s at 1 kHz, longer than disks usually stall.
 ROWS = 1 << 14
 FRAMES = 1 << 16
 
 
 class Ring:
-    """Both rings in one piece of shared memory, to be handed to another process by descriptor."""
+    """Both rings in one block of shared memory, shared with another process by descriptor."""
 
     def __init__(self, descriptor: int) -> None:
         self.descriptor = descriptor
@@ -60,7 +60,7 @@ class Ring:
 
     @classmethod
     def create(cls) -> "Ring":
-        """A new, empty ring."""
+        """Create an empty ring."""
         descriptor = os.memfd_create("canwall-record")
         os.ftruncate(descriptor, cls.size())
         return cls(descriptor)
@@ -73,15 +73,15 @@ class Ring:
 
     @classmethod
     def size(cls) -> int:
-        """Bytes of shared memory."""
+        """Return the size of the shared memory [bytes]."""
         return cls._offsets()[2]
 
     def close(self) -> None:
-        """Let go of the descriptor; the memory goes with its last user."""
+        """Close the descriptor; the memory is freed with its last user."""
         os.close(self.descriptor)
 
     def log_frame(self, time_s: float, message: can.Message, received: bool) -> None:
-        """Note a frame (a `drive.FrameLog`)."""
+        """Put in a frame (a `drive.FrameLog`)."""
         flags = (
             RECEIVED * received
             | REMOTE * message.is_remote_frame
@@ -106,11 +106,11 @@ class Ring:
         return float(max(rows, frames))
 
     def take_rows(self) -> NDArray[np.void]:
-        """Reader: all rows that are waiting, copied out; shape (n,), dtype ROW."""
+        """Take out all rows: a copy of shape (n,), dtype ROW; called by the consumer."""
         return self._take(self.rows, "row_head", "row_tail")
 
     def take_frames(self) -> NDArray[np.void]:
-        """Reader: all frames that are waiting, copied out; shape (n,), dtype FRAME."""
+        """Take out all frames: a copy of shape (n,), dtype FRAME; called by the consumer."""
         return self._take(self.frames, "frame_head", "frame_tail")
 
     def _take(self, ring: NDArray[np.void], head: str, tail: str) -> NDArray[np.void]:
@@ -121,7 +121,7 @@ class Ring:
 
 
 def to_message(frame: NDArray[np.void], channel: str) -> can.Message:
-    """A FRAME as python-can's message."""
+    """Convert a FRAME to python-can's message."""
     flags, length = int(frame["flags"]), int(frame["length"])
     remote = bool(flags & REMOTE)
     return can.Message(
@@ -147,7 +147,7 @@ def put_frame(
     length: int,
     data: int,
 ) -> None:
-    """Writer: append a frame, or count it as lost where the reader is too far behind."""
+    """Append a frame, or count it as lost if the consumer is too far behind."""
     header: Record = headers[0]
     if header.frame_head - header.frame_tail >= len(frames):
         header.frames_lost += 1
@@ -163,7 +163,7 @@ def put_frame(
 
 @compiled
 def put_row(headers: NDArray[np.void], ring: NDArray[np.void], rows: NDArray[np.void]) -> None:
-    """Writer: append a row (array of shape (1,)), or count it as lost."""
+    """Append a row (array of shape (1,)), or count it as lost."""
     header: Record = headers[0]
     if header.row_head - header.row_tail >= len(ring):
         header.rows_lost += 1

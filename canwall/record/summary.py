@@ -1,4 +1,4 @@
-"""The summary of a run: the metrics over its record, strike by strike."""
+"""Summary of a run: metrics of its record, strike by strike."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -20,10 +20,14 @@ Array = NDArray[np.float64]
 def summarise(
     signals: "pa.Table", settings: Settings, units: DriveUnits, referent: Array | None
 ) -> dict[str, Any]:
-    """Energy, contacts and chatter of a run.
+    """Return energy, contacts and chatter of a run.
 
-    signals is the run's record, one row per cycle; referent the continuous wall's positions at
-    the same SYNCs, shape (n,), or None where a person was at the handle.
+    Args:
+        signals: Record of the run, one row per cycle.
+        settings: Configuration of the run.
+        units: Scales of the drive.
+        referent: Positions at the continuous wall at the same SYNCs, shape (n,); None if a person
+            was at the handle.
     """
     y, force = numbers(signals, "y"), numbers(signals, "force_applied")
     stiffness, laws = numbers(signals, "stiffness"), signals["law"]
@@ -53,7 +57,7 @@ def summarise(
 
 
 def _changes(signals: "pa.Table") -> Array:
-    """Cycles at which law, stiffness, damping or place of the wall are others than before."""
+    """Return the cycles at which law, stiffness, damping or position of the wall change."""
     columns = [np.from_dlpack(signals["law"].combine_chunks().indices)]
     columns += [numbers(signals, name) for name in ("stiffness", "damping", "wall_position_rad")]
     differs = np.any([np.diff(column) != 0 for column in columns], axis=0)

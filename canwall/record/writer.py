@@ -1,9 +1,9 @@
-"""The process that empties the ring into the run's folder: `python -m canwall.record.writer`.
+"""Process that empties the ring into the run's folder: `python -m canwall.record.writer`.
 
-It takes orders from its standard input (`recorder.Recorder` gives them) and answers on standard
-output, a line of JSON each. It ends when the master closes its end of the pipe, by an order or by
-dying, and completes the files first. It also draws the picture: it is there, has nothing to do
-while the master sets up the drive, and can load the plotting library meanwhile.
+It takes orders from standard input (sent by `recorder.Recorder`) and answers on standard output,
+one line of JSON each. When the master closes its end of the pipe, or dies, the writer completes
+the files and ends. It also draws the picture, since it can load the plotting library while the
+master sets up the drive.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ from canwall.record.folder import RunFolder, stream_of
 from canwall.record.pictures import plot_run
 from canwall.record.ring import Ring, to_message
 
-#: Rows of one row group, unless the run ends before.
+#: Rows per row group; the last one may have fewer.
 _ROW_GROUP = 8192
 _POLL_S = 0.02
 #: Interval of synchronisation to disk: the most of a run that a power failure can lose [s].
@@ -37,10 +37,9 @@ _SYNCHRONISE_S = 0.5
 
 
 class _SignalsFile:
-    """Rows as a stream that needs no ending, and as Parquet once they are complete.
+    """Rows as a stream that is readable while incomplete, and as Parquet once complete.
 
-    What was synchronised is on the disk: after a loss of power, `folder.read_signals` reads the
-    stream up to its last second.
+    After a power failure, `folder.read_signals` reads the stream up to the last synchronisation.
     """
 
     def __init__(self, path: Path, laws: list[str]) -> None:
@@ -56,7 +55,7 @@ class _SignalsFile:
         self._waiting.append(rows)
 
     def synchronise(self) -> None:
-        """Have everything that was added so far on the disk."""
+        """Write everything added so far through to the disk."""
         if self._waiting:
             rows = np.concatenate(self._waiting)
             self._waiting = []
@@ -77,7 +76,7 @@ class _SignalsFile:
                 if sum(map(len, group)) >= _ROW_GROUP:
                     file.write_table(pa.Table.from_batches(group))
                     group = []
-            # A file without rows has its columns all the same.
+            # A file without rows has the columns nevertheless.
             file.write_table(pa.Table.from_batches(group, self._schema))
         self._stream_path.unlink()
 
@@ -88,7 +87,7 @@ def _synchronise(file: IO[Any]) -> None:
 
 
 class _BusLog:
-    """Frames in one of python-can's formats; nowhere without a path."""
+    """Frames in one of python-can's formats; discarded without a path."""
 
     def __init__(self, path: Path | None, channel: str) -> None:
         self._channel = channel
@@ -100,7 +99,7 @@ class _BusLog:
                 self._log.on_message_received(to_message(frame, self._channel))
 
     def synchronise(self) -> None:
-        # The database has no file of its own, and keeps its own time.
+        # The database writer has no file object, and commits on its own schedule.
         file = getattr(self._log, "file", None)
         if file is not None:
             _synchronise(file)
@@ -113,7 +112,7 @@ class _BusLog:
 def write(
     ring: Ring, orders: IO[bytes], folder: Path, bus_log: str, channel: str, laws: list[str]
 ) -> None:
-    """Empty the ring into the folder until there is an order, or nobody left to give one."""
+    """Empty the ring into the folder until an order comes or the master is gone."""
     signals = _SignalsFile(folder / "signals.parquet", laws)
     log = _BusLog(folder / bus_log if bus_log else None, channel)
 
@@ -143,13 +142,13 @@ def _is_ordered(orders: IO[bytes], timeout_s: float) -> bool:
 
 
 def _record(ring: Ring, orders: IO[bytes], order: dict[str, Any]) -> str:
-    """Write the record that the order describes; what went wrong, empty if nothing."""
+    """Write the record that the order describes; return an error message or an empty text."""
     try:
         write(
             ring, orders, Path(order["folder"]), order["bus_log"], order["channel"], order["laws"]
         )
     except (OSError, pa.ArrowException, sqlite3.Error) as failure:
-        # The master is not to hear of it by its ring filling up: keep emptying it.
+        # Keep emptying the ring, so that it does not fill up and disturb the master.
         while not _is_ordered(orders, _POLL_S):
             ring.take_frames()
             ring.take_rows()
@@ -158,7 +157,7 @@ def _record(ring: Ring, orders: IO[bytes], order: dict[str, Any]) -> str:
 
 
 def _draw(folder: Path) -> str:
-    """Draw the run's picture; what went wrong, empty if nothing."""
+    """Draw the run's picture; return an error message or an empty text."""
     try:
         plot_run(RunFolder(folder))
     except (OSError, ConfigError) as failure:
@@ -172,9 +171,9 @@ def _answer(error: str) -> None:
 
 
 def main() -> None:
-    """Take orders, a line of JSON each: what to record, to complete it, to draw it."""
+    """Execute orders to record, to complete the record, and to draw it, one line of JSON each."""
     ring = Ring(int(sys.argv[1]))
-    # Unbuffered: a line that waits is to be seen by select.
+    # Unbuffered, so that select sees a waiting line.
     with open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as orders:
         if begin := orders.readline():
             order = json.loads(begin)
@@ -183,7 +182,7 @@ def main() -> None:
                 _answer(error)
             while orders.readline():
                 _answer(_draw(Path(order["folder"])))
-    gc.freeze()  # the master waits for the end: no search for garbage in all that was imported
+    gc.freeze()  # the master waits for the exit: spare it a collection of all imported modules
 
 
 if __name__ == "__main__":
