@@ -383,7 +383,7 @@ class UnixBus(can.BusABC):
 
     @property
     def overruns(self) -> int:
-        """Number of frames that this process dropped: a receiver, maybe itself, was full."""
+        """Number of frames that this process dropped because a receiver, maybe itself, was full."""
         return self._inbox.overruns
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:

@@ -57,5 +57,5 @@ class Drive(Section):
 
     @property
     def parameters_by_index(self) -> dict[tuple[int, int], int]:
-        """Return `parameters` by index and sub-index."""
+        """`parameters` by index and sub-index."""
         return by_index(self.parameters)

@@ -55,7 +55,7 @@ class Simulation(Section):
 
     @property
     def objects_by_index(self) -> dict[tuple[int, int], int]:
-        """Return `objects` by index and sub-index."""
+        """`objects` by index and sub-index."""
         return by_index(self.objects)
 
     def with_ideal_servo(self) -> Self:

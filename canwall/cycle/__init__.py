@@ -1,4 +1,4 @@
-"""The SYNC-driven loop: exchange of frames, one compiled step, timing, limits and trips."""
+"""SYNC-driven loop: exchange of frames, one compiled step, timing, limits and trips."""
 
 from canwall.cycle.axis import WallAxis, WallStage
 from canwall.cycle.bus_monitor import BusMonitor

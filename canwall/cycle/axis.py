@@ -18,7 +18,7 @@ from canwall.walls import Law
 
 @dataclass(frozen=True)
 class WallStage:
-    """From cycle j on, this is the wall, and these are its limits."""
+    """Wall and limits in force from cycle j on."""
 
     j: int
     wall: Wall
@@ -27,7 +27,7 @@ class WallStage:
 
 @dataclass
 class WallAxis:
-    """A drive that is set up, its wall, and the ring that takes its rows."""
+    """A drive that is set up, its wall, and the ring for its rows."""
 
     node: DriveNode
     setup: DriveSetup
@@ -35,19 +35,19 @@ class WallAxis:
     laws: Sequence[Law]
     ring: Ring
     changes: list[WallStage] = field(default_factory=list)
-    #: Changes of the wall that other processes ask for.
+    #: Changes of the wall requested by other processes.
     mailbox: Mailbox | None = None
-    #: Reason to give up the wall that came from outside the cycle; empty: there is none.
+    #: Reason from outside the cycle to give up the wall; empty if there is none.
     reported: str = ""
-    #: Number of the next wall of those that take turns.
+    #: Number of the next of the alternating walls.
     next_turn: int = 1
 
     def __post_init__(self) -> None:
         self.cycle: NDArray[np.void] = make_cycle(self.settings, self.setup, self.laws)
         self.row = np.zeros(1, ROW)
-        #: Its frames and their lateness, dtype DRIVE_FRAMES, a view of the exchange's array.
+        #: Frames and their lateness, dtype DRIVE_FRAMES; a view of the exchange's array.
         self.frames = np.zeros(1, DRIVE_FRAMES)
-        #: From a TPDO to its RPDO, and from the instant at which the SYNC was due to the RPDO.
+        #: Times from a TPDO to its RPDO, and from the instant at which SYNC was due to the RPDO.
         self.latency, self.sync_to_rpdo = np.zeros(1, HISTOGRAM), np.zeros(1, HISTOGRAM)
         given = self.settings.estimator.delay_cycles
         self.delay = SYNCHRONOUS_DELAY if given is None else given
@@ -61,29 +61,29 @@ class WallAxis:
 
     @property
     def active(self) -> bool:
-        """True while there may be a torque: the wall is rendered, or the delay measured."""
+        """True while the wall is rendered or the delay measured, so that there may be a torque."""
         return int(self.cycle["phase"][0]) in (Phase.RENDERING, Phase.MEASURING)
 
     @property
     def late_rpdo(self) -> int:
-        """RPDOs that were sent after the next SYNC was due."""
+        """Number of RPDOs that were sent after the next SYNC was due."""
         return int(self.frames["late_rpdo"][0])
 
     @property
     def late_in_a_row(self) -> int:
-        """Late RPDOs since the last one in time."""
+        """Number of late RPDOs since the last one in time."""
         return int(self.frames["late_in_a_row"][0])
 
     @property
     def wrong_length(self) -> int | None:
-        """Length of the last TPDO that did not carry what was mapped [bytes], None without one."""
+        """Length of the last TPDO that was too short [bytes], None if there was none."""
         length = int(self.frames["wrong_length"][0])
         return length if length >= 0 else None
 
     def give_up(self, text: str) -> None:
-        """End the wall because of something outside the cycle; the first reason counts.
+        """End the wall for a reason from outside the cycle; the first reason counts.
 
-        Ignored before there may be a torque, and while the wall is being left.
+        Has no effect unless the axis is active.
         """
         if self.active and not self.cycle["trip"][0]:
             self.reported = text

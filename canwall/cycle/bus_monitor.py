@@ -1,4 +1,4 @@
-"""Frames beside the cycle that end a wall: EMCY, another NMT state, bus-off, a second SYNC."""
+"""Frames outside the cycle that end a wall: EMCY, another NMT state, bus-off, a second SYNC."""
 
 from collections.abc import Sequence
 
@@ -16,13 +16,19 @@ _BUS_OFF = 0x40
 
 
 class BusMonitor:
-    """Turns such frames into trips of the axis that they concern, in the cycle in which they come.
+    """Turns such frames into trips of the axis they concern, in the cycle in which they arrive.
 
-    Nothing trips before the wall is rendered, or while it is being left.
+    Nothing trips before a wall is rendered, or while its drive is being disabled.
     """
 
     def __init__(self, link: Link, axes: Sequence[WallAxis], sync_cob_id: int | None) -> None:
-        """Subscribe. sync_cob_id: that of the SYNC if nobody else may send one, else None."""
+        """Subscribe to these frames.
+
+        Args:
+            link: The bus.
+            axes: Drives and their walls.
+            sync_cob_id: COB-ID of the SYNC if only this master may send it, else None.
+        """
         self._axes = axes
         self.error_frames = 0
         self.notes: list[str] = []

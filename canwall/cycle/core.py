@@ -1,10 +1,10 @@
-"""The rules of a cycle, compiled and without input or output: frames and time in, frames out.
+"""Rules of a cycle, compiled and without input or output: frames and time in, frames out.
 
-Deadlines, SYNC and its counter, awaited TPDOs, steps, RPDOs, lateness, heartbeat and guarding
-frames, the record and the hand-over of all other frames stand here once. A transport moves the
-frames and sleeps: it calls `proceed` with the time, and `take` with each frame that it receives;
-both return what the core wants next (`Want`). All times are CLOCK_MONOTONIC in nanoseconds
-(time.perf_counter_ns), but for the kernel's stamps.
+This is the only implementation of deadlines, SYNC and its counter, awaited TPDOs, steps, RPDOs,
+lateness, heartbeat and guarding frames, the record, and the hand-over of all other frames. A
+transport moves the frames and sleeps: it calls `proceed` with the time, and `take` with each frame
+that it receives; both return what the core wants next (`Want`). All times are CLOCK_MONOTONIC in
+nanoseconds (time.perf_counter_ns), except for the kernel's time stamps.
 """
 
 from enum import IntEnum
@@ -31,9 +31,9 @@ from canwall.record.ring import (
     put_row,
 )
 
-#: A sleep ends when the scheduler likes: the last part of a wait is a busy one.
+#: Last part of a wait, which is a busy one because the end of a sleep is not precise.
 SPIN_NS = 200_000
-#: Frames that may wait for Python between two of its turns.
+#: Capacity for frames that wait for Python.
 INBOX = 1 << 12
 #: Fill level of the record's rings above which simulated time waits for the writer.
 BACKLOG = 0.5
@@ -50,13 +50,13 @@ class Want(IntEnum):
     FRAME = 1
     """Receive one frame and `take` it, or `proceed` at `until_ns`."""
     DRAIN = 2
-    """`take` every frame that is there, then `proceed`."""
+    """`take` every waiting frame, then `proceed`."""
     SLEEP = 3
     """Sleep until `until_ns`, then `proceed`."""
     SPIN = 4
-    """`proceed` again at once: the rest of the wait is too short for a sleep."""
+    """`proceed` again at once; the rest of the wait is too short for a sleep."""
     DONE = 5
-    """The cycles that were asked for are done, or Python has something to do before the next."""
+    """The requested cycles are done, or Python has something to do before the next one."""
     HAND_OVER = 6
     """Python has to see the frames in the inbox before the torque is computed; then `proceed`."""
     WRITER = 7
@@ -75,13 +75,13 @@ _BEFORE, _DRAINING, _SYNC_DUE, _SYNC_SENT, _SYNC_AWAITED, _TPDO_AWAITED, _RPDO_S
 
 
 class Handling(IntEnum):
-    """Hand-over of a frame that is not the cycle's own, by its CAN-ID."""
+    """Hand-over of a frame that does not belong to the cycle, by its CAN-ID."""
 
     BETWEEN_CYCLES = 0
     URGENT = 1
-    """Before the next torque is computed: it may end the wall."""
+    """Before the next torque is computed, because it may end the wall."""
     URGENT_UNLESS_OPERATIONAL = 2
-    """As URGENT, unless it is one byte that says NMT OPERATIONAL."""
+    """As URGENT, except for a heartbeat of a node in OPERATIONAL."""
     LOG_ONLY = 3
 
 
@@ -91,14 +91,14 @@ _URGENT, _UNLESS_OPERATIONAL, _LOG_ONLY = (
     int(Handling.LOG_ONLY),
 )
 
-#: The frames of one drive, their timing, and the addresses of what belongs to its wall.
+#: Frames of one drive, their timing, and the addresses of the records of its wall.
 DRIVE_FRAMES = np.dtype(
     [
         ("tpdo_id", "i8"),
         ("tpdo_length", "i8"),
         ("rpdo_id", "i8"),
         ("rpdo_length", "i8"),
-        ("constant", "i8"),  # what a fixed RPDO carries besides controlword and torque
+        ("constant", "i8"),  # content of a fixed RPDO besides controlword and torque
         ("cycle", "u8"),
         ("row", "u8"),
         ("latency", "u8"),
@@ -106,15 +106,15 @@ DRIVE_FRAMES = np.dtype(
         ("header", "u8"),
         ("rows", "u8"),
         ("awaited", "?"),
-        ("received_ns", "i8"),  # when the TPDO came, or was given up
+        ("received_ns", "i8"),  # when the TPDO arrived, or counted as missing
         ("late_rpdo", "i8"),
         ("late_in_a_row", "i8"),
         ("late_limit", "i8"),
-        ("wrong_length", "i8"),  # of the last TPDO that was too short; -1: there was none
+        ("wrong_length", "i8"),  # of the last TPDO that was too short, -1 if there was none
     ],
     align=True,
 )
-#: A heartbeat or guarding frame that a drive's watchdog waits for.
+#: A heartbeat or guarding frame that a drive's watchdog expects.
 ERROR_CONTROL = np.dtype(
     [("can_id", "i8"), ("length", "i8"), ("data", "i8"), ("period_ns", "i8"), ("due_ns", "i8")],
     align=True,
@@ -126,7 +126,7 @@ CORE = np.dtype(
         ("until_ns", "i8"),
         ("sending_ns", "i8"),  # when the SYNC was to be sent
         ("stage", "i8"),
-        ("left", "i8"),  # cycles that are still to be done
+        ("left", "i8"),  # remaining cycles
         ("wall_offset_ns", "i8"),  # CLOCK_REALTIME less CLOCK_MONOTONIC
         # SYNC
         ("real_time", "?"),
@@ -137,7 +137,7 @@ CORE = np.dtype(
         ("sync_patience_ns", "i8"),
         ("period_ns", "i8"),
         ("deadline_ns", "i8"),
-        ("sync_ns", "i8"),  # of the latest SYNC; 0: there was none yet
+        ("sync_ns", "i8"),  # of the latest SYNC, 0 before the first
         ("sync_interval_s", "f8"),
         ("sync_interval", "u8"),
         ("sync_error", "u8"),
@@ -153,7 +153,7 @@ CORE = np.dtype(
         ("error_control", "u8"),
         ("error_control_length", "i8"),
         ("error_control_sent", "i8"),
-        # Frames for Python, and all frames for the log (address 0: there is none).
+        # Frames for Python, and all frames for the log (address 0: no log).
         ("handling", "u1", (0x800,)),
         ("urgent", "?"),
         ("inbox_header", "u8"),
@@ -169,7 +169,7 @@ CORE = np.dtype(
 
 @compiled
 def begin(cores: NDArray[np.void], most: int, wall_offset_ns: int) -> None:
-    """Ask for a cycle, and for up to `most` of them while Python has nothing to do in between."""
+    """Request one cycle, or up to `most` while Python has nothing to do in between."""
     core: Record = cores[0]
     core.left = most
     core.strikes = _strikes(core)
@@ -178,7 +178,7 @@ def begin(cores: NDArray[np.void], most: int, wall_offset_ns: int) -> None:
 
 @compiled
 def abandon(cores: NDArray[np.void]) -> None:
-    """Give up the cycle under way: the bus has failed. `begin` begins another."""
+    """Abandon the present cycle after a failure of the bus; `begin` starts another one."""
     core: Record = cores[0]
     core.stage = _BEFORE
     core.left = 0
@@ -186,10 +186,10 @@ def abandon(cores: NDArray[np.void]) -> None:
 
 @compiled
 def proceed(cores: NDArray[np.void], now_ns: int) -> int:
-    """Go on with the cycle; return a `Want`.
+    """Continue the cycle; return a `Want`.
 
-    Also confirms a frame that was to be sent, and that there was no frame (more) to be taken.
-    cores has dtype CORE and shape (1,).
+    The call also confirms that a frame was sent, or that no (further) frame is waiting. cores has
+    dtype CORE and shape (1,).
     """
     core: Record = cores[0]
     stage = core.stage
@@ -216,7 +216,7 @@ def proceed(cores: NDArray[np.void], now_ns: int) -> int:
 def take(
     cores: NDArray[np.void], can_id: int, length: int, data: int, now_ns: int, stamp_ns: int
 ) -> int:
-    """Take a frame that was received; return a `Want`.
+    """Process a received frame; return a `Want`.
 
     can_id has the flags of linux/can.h, data is a little-endian number, stamp_ns the kernel's time
     stamp (CLOCK_REALTIME) or 0.
@@ -229,7 +229,7 @@ def take(
         for k in range(len(drives)):
             drive: Record = drives[k]
             if drive.awaited and can_id == drive.tpdo_id:
-                # A TPDO that is too short does not carry what was mapped: as good as none.
+                # A TPDO that is too short lacks mapped objects, and counts as missing.
                 complete = length >= drive.tpdo_length
                 if not complete:
                     drive.wrong_length = length
@@ -239,8 +239,8 @@ def take(
         core.deadline_ns = now_ns + core.period_ns
         _begin_cycle(core, now_ns)
         return _await_tpdos(core, now_ns)
-    # Before a SYNC this may be a TPDO that is late, or came twice: taken for the next one, it
-    # would leave every position after it a cycle old.
+    # Before a SYNC this may be a late or duplicate TPDO. Mistaken for the next one, it would delay
+    # all following positions by a cycle.
     _hand_over(core, wall_ns, can_id, length, data)
     if core.stage == _DRAINING:
         return _DRAIN
@@ -249,7 +249,7 @@ def take(
 
 @compiled
 def _start(core: Record, now_ns: int) -> int:
-    """Begin a cycle, or end the cycles that were asked for."""
+    """Begin a cycle, or end the requested cycles."""
     if core.left <= 0:
         return _DONE
     if _record_is_behind(core):
@@ -270,7 +270,7 @@ def _start(core: Record, now_ns: int) -> int:
 
 @compiled
 def _send_sync(core: Record, now_ns: int) -> int:
-    """Send the SYNC when it is due; what had come before was taken."""
+    """Send the SYNC when it is due, after all earlier frames were processed."""
     if core.stage == _DRAINING:
         if core.urgent:
             core.stage = _BEFORE
@@ -282,7 +282,7 @@ def _send_sync(core: Record, now_ns: int) -> int:
         core.deadline_ns = next_deadline(core.deadline_ns, now_ns, core.period_ns)
     length = 0
     if core.sync_overflow:
-        # CiA 301, 7.2.5.3: from 1 to the overflow value, and again from 1.
+        # CiA 301, 7.2.5.3: the counter runs from 1 to the overflow value.
         core.sync_counter = core.sync_counter % core.sync_overflow + 1
         length = 1
     core.sending_ns = now_ns
@@ -292,13 +292,13 @@ def _send_sync(core: Record, now_ns: int) -> int:
 
 @compiled
 def next_deadline(deadline_ns: int, now_ns: int, period_ns: int) -> int:
-    """Return the next instant of the grid that lies ahead: a late cycle is not made up for."""
+    """Return the next instant of the time grid in the future; missed ones are skipped."""
     return deadline_ns + (max(0, now_ns - deadline_ns) // period_ns + 1) * period_ns
 
 
 @compiled
 def _begin_cycle(core: Record, sync_ns: int) -> None:
-    """Await the TPDOs of a SYNC."""
+    """Begin to wait for the TPDOs of a SYNC."""
     interval = sync_ns - core.sync_ns if core.sync_ns else 0
     if interval:
         observe_ns(elements(core.sync_interval, 1, HISTOGRAM), interval)
@@ -317,7 +317,7 @@ def _begin_cycle(core: Record, sync_ns: int) -> None:
 
 @compiled
 def _await_tpdos(core: Record, now_ns: int) -> int:
-    """Wait for the TPDOs that are missing; answer without them when time is up."""
+    """Wait for the missing TPDOs; answer without them after the timeout."""
     core.stage = _TPDO_AWAITED
     drives = elements(core.drives, core.drives_length, DRIVE_FRAMES)
     for k in range(len(drives)):
@@ -365,7 +365,7 @@ def _complete_answer(core: Record, sent_ns: int) -> None:
 
 @compiled
 def _send_error_control(core: Record, now_ns: int) -> int:
-    """Send the next heartbeat or guarding frame that is due; then the cycle is over."""
+    """Send the next heartbeat or guarding frame that is due; without one, end the cycle."""
     core.stage = _AFTER
     frames = elements(core.error_control, core.error_control_length, ERROR_CONTROL)
     for k in range(core.error_control_sent, len(frames)):
@@ -389,7 +389,7 @@ def _send(core: Record, can_id: int, length: int, data: int) -> int:
 
 @compiled
 def _urgent(core: Record) -> int:
-    """HAND_OVER, once, where a frame has come that may end the wall; else 0."""
+    """Return HAND_OVER once for each arrival of frames that may end the wall, else 0."""
     if not core.urgent:
         return 0
     core.urgent = False
@@ -398,7 +398,7 @@ def _urgent(core: Record) -> int:
 
 @compiled
 def _flags(can_id: int) -> int:
-    """Flags of a record's frame for those of an identifier."""
+    """Convert the flags of an identifier to those of a frame in the record."""
     flags = REMOTE if can_id & CAN_RTR else 0
     flags |= ERROR if can_id & CAN_ERR else 0
     return flags | (EXTENDED if can_id & CAN_EFF else 0)
@@ -421,7 +421,7 @@ def _log(core: Record, wall_ns: int, received: int, can_id: int, length: int, da
 
 @compiled
 def _hand_over(core: Record, wall_ns: int, can_id: int, length: int, data: int) -> None:
-    """Leave a frame to Python, at the latest before the next cycle."""
+    """Hand a frame to Python, at the latest before the next cycle."""
     flags = RECEIVED | _flags(can_id)
     standard = not flags & (REMOTE | EXTENDED | ERROR)
     handling = core.handling[can_id & 0x7FF]
@@ -445,7 +445,7 @@ def _hand_over(core: Record, wall_ns: int, can_id: int, length: int, data: int) 
 
 @compiled
 def _record_is_behind(core: Record) -> bool:
-    """Return whether the writer of the record is behind; only simulated time can wait for it."""
+    """Return True if the writer of the record is behind, which only simulated time waits for."""
     if core.real_time or not core.writer_reads:
         return False
     drives = elements(core.drives, core.drives_length, DRIVE_FRAMES)
@@ -460,7 +460,7 @@ def _record_is_behind(core: Record) -> bool:
 
 @compiled
 def _wants_python(core: Record) -> bool:
-    """Return whether Python is due before the next cycle: a trip, a strike's end, frames."""
+    """Return True if Python has to act before the next cycle (trip, end of a strike, frames)."""
     inbox: Record = elements(core.inbox_header, 1, HEADER)[0]
     if inbox.frame_head != inbox.frame_tail:
         return True

@@ -1,9 +1,9 @@
 """Measurement of the delay D of the loop, from the sample of a position to its torque.
 
-Drives do not report it. Small torques in pairs, one way and back, of random sign, excite the motor;
-D, mass, friction and spring are fitted so that the exact motion under these torques comes closest
-to the measured one. Positions are compared after subtraction of their moving average, which
-removes the slow motion of a hand.
+Drives do not report it. Pairs of small opposite torques of random sign excite the motor; D, mass,
+friction and spring are fitted so that the exact motion under these torques comes closest to the
+measured one. Positions are compared after subtraction of their moving average, which removes the
+slow motion of a hand.
 """
 
 import math
@@ -23,13 +23,13 @@ Array = NDArray[np.float64]
 
 #: The torques are random but the same in every run.
 _SEED = 402
-#: The share of the motion that the model has to explain, for a delay to be believed.
+#: Share of the motion that the model has to explain for a delay to be accepted.
 _EXPLAINED = 0.5
-#: Delays from which the fit begins, in periods.
+#: Initial values of the delay in the fit [periods].
 _GUESSES = np.arange(0.0, MAX_DELAY + 0.1, 0.5)
 #: Travel of the handle under a pair of torques [rad]: many counts, yet hardly felt by a hand.
 _TRAVEL_RAD = 0.01
-#: The longest torque, and the moving average, in cycles.
+#: Longest torque, and length of the moving average [cycles].
 _LONGEST, _AVERAGED = 8, 33
 
 
@@ -41,7 +41,7 @@ class DelayTest:
         self.axis = axis
         self.cycles = settings.estimator.measure_cycles
         torque = min(settings.estimator.measure_torque_nm, settings.limits.torque_nm)
-        # A torque f for n periods, and back: the handle moves by f·(nT)²/m.
+        # A torque f for n periods, then -f for n periods, moves the handle by f·(nT)²/m.
         farthest = _TRAVEL_RAD * settings.mechanics.inertia_kg_m2 / settings.bus.cycle_s**2
         length = min(max(1, math.floor(math.sqrt(farthest / torque))), _LONGEST)
         per_mille = min(torque, farthest) / float(axis.cycle["nm_per_mille"][0])
@@ -61,7 +61,7 @@ class DelayTest:
         self._forces.append(float(row["torque_cmd"]))
 
     def delay(self) -> float:
-        """Return D in periods. Raises ValueError where the torques do not explain the motion."""
+        """Return D in periods. Raises ValueError if the torques do not explain the motion."""
         settings = self.axis.settings
         return measured_delay(
             np.array(self._positions),
@@ -72,7 +72,7 @@ class DelayTest:
 
 
 def excitation(cycles: int, length: int) -> NDArray[np.int64]:
-    """Return signs of the torque, shape (cycles,), in pairs that leave the handle no speed.
+    """Return signs of the torque, shape (cycles,), in pairs that leave the handle at rest.
 
     Each torque of a pair lasts for `length` cycles; an incomplete pair at the end is left out.
     """
@@ -85,7 +85,7 @@ def measured_delay(position: Array, torque: Array, period: float, mechanics: Mec
     """Return D in periods from positions [rad] at each SYNC and torques [N·m] commanded after it.
 
     Both have shape (n,); a missing position is NaN. The fit starts from `mechanics`, at rest in the
-    first position. Raises ValueError where the torques do not explain the motion.
+    first position. Raises ValueError if the torques do not explain the motion.
     """
     known = np.isfinite(position)
     j = np.arange(len(position))
@@ -113,7 +113,7 @@ def measured_delay(position: Array, torque: Array, period: float, mechanics: Mec
 
 
 def _fast(signal: Array) -> Array:
-    """Return a signal less its moving average."""
+    """Return a signal minus its moving average."""
     return np.asarray(signal - uniform_filter1d(signal, _AVERAGED, mode="nearest"))
 
 

@@ -1,4 +1,4 @@
-"""The exchange of a cycle's frames: the compiled core (`core`) on a transport, as the loop sees it.
+"""Exchange of a cycle's frames: the compiled core (`core`) on a transport, as the loop sees it.
 
 In real time the SYNCs keep to absolute deadlines; in simulated time they follow one another as
 fast as the drives answer.
@@ -26,15 +26,15 @@ from canwall.drive.watchdog import ErrorControlFrame
 from canwall.record import Phase
 from canwall.record.ring import FRAME, HEADER, RECEIVED, Ring, to_message
 
-#: In simulated time nothing is late: this long a TPDO is waited for before it counts as lost.
+#: Time after which a TPDO counts as lost in simulated time, where nothing is late.
 _SIMULATED_TIMEOUT_S = 1.0
-#: Once one was missed, the next ones are waited for no longer than this.
+#: The same once a TPDO has been lost.
 _MISSING_TIMEOUT_S = 0.05
-#: The part of a real cycle in which the TPDO has to arrive, for the RPDO to be in time.
+#: Part of a cycle in real time within which the TPDO has to arrive for the RPDO to be in time.
 _SYNCHRONOUS_WINDOW = 0.8
-#: A writer that takes nothing for this long has died; what is lost is counted.
+#: Time without progress after which the writer counts as dead; lost items are counted.
 _WRITER_PATIENCE_S = 10.0
-#: Without a SYNC for this long, and no less than so many periods, its producer has fallen silent.
+#: Time without a SYNC, and the least number of periods, after which its producer counts as silent.
 _SYNC_PATIENCE_S, _SYNC_PATIENCE_CYCLES = 0.1, 10
 
 
@@ -46,13 +46,13 @@ class SyncLostError(can.CanOperationError):
 
 
 class _FrameRing:
-    """Frames that compiled code leaves to this process."""
+    """Frames that compiled code hands to Python."""
 
     def __init__(self) -> None:
         self.header, self.frames = np.zeros(1, HEADER), np.zeros(INBOX, FRAME)
 
     def take(self) -> Iterator[NDArray[np.void]]:
-        """Yield each frame that waits, the oldest first."""
+        """Yield the waiting frames, the oldest first."""
         header = self.header
         while header["frame_tail"][0] < header["frame_head"][0]:
             frame = self.frames[header["frame_tail"][0] % len(self.frames)].copy()
@@ -71,25 +71,25 @@ class Exchange:
         external_sync: bool = False,
         transport: TransportFactory = PythonCanTransport,
     ) -> None:
-        """Prepare the cycles of axes that share a SYNC, the first axis' drive's.
+        """Prepare the cycles of axes that share the SYNC of the first one's drive.
 
         Args:
-            link: the bus.
-            axes: drives that are set up, and their walls.
-            real_time: whether SYNCs keep to the clock.
-            external_sync: whether somebody else produces the SYNC.
-            transport: moves the frames.
+            link: The bus.
+            axes: Drives that are set up, and their walls.
+            real_time: True if SYNCs follow the clock.
+            external_sync: True if another node produces the SYNC.
+            transport: Makes the transport of the frames.
 
         Raises:
-            can.CanInitializationError: the transport cannot work on this bus.
+            can.CanInitializationError: If the transport cannot work on this bus.
         """
         self._link = link
         self.axes = axes
         self._real_time = real_time
         self._period_s = float(axes[0].cycle["period"][0])
-        #: Cycles that may be done before the loop looks after everything else again.
+        #: Cycles that may be done before the loop attends to everything else again.
         self.ahead = 1
-        #: Intervals of the SYNC, and how far each is from its period.
+        #: Intervals of the SYNC, and their deviations from the period.
         self.sync_interval, self.sync_error = np.zeros(1, HISTOGRAM), np.zeros(1, HISTOGRAM)
         #: True while simulated time waits for the writer of the record; False once that has died.
         self.waits_for_writer = True
@@ -119,7 +119,7 @@ class Exchange:
                 self._period_s,
             ),
         )
-        # What is compiled is loaded at its first call.
+        # Compiled code is loaded at its first call.
         cycle_core.begin(self._core, 0, 0)
         self.transport.run()
 
@@ -154,12 +154,12 @@ class Exchange:
 
     @property
     def last_sync_ns(self) -> int:
-        """Instant of the latest SYNC, by time.perf_counter_ns; 0: there was none yet."""
+        """Instant of the latest SYNC, by time.perf_counter_ns, or 0 before the first."""
         return int(self._core["sync_ns"][0])
 
     @property
     def last_error_control_ns(self) -> int:
-        """Instant of the latest heartbeat or guarding frame; 0: there was none yet."""
+        """Instant of the latest heartbeat or guarding frame, or 0 before the first."""
         frames = self._error_control
         sent = [int(f["due_ns"] - f["period_ns"]) for f in frames if f["due_ns"]]
         return max(sent, default=0)
@@ -169,15 +169,15 @@ class Exchange:
         return max(_SYNC_PATIENCE_S, _SYNC_PATIENCE_CYCLES * self._period_s)
 
     def longest_pause_s(self) -> float:
-        """Longest time that the drives have been without a SYNC, the one until now included."""
+        """Return the longest time that the drives were without a SYNC, up to now."""
         since = time.perf_counter_ns() - self.last_sync_ns if self.last_sync_ns else 0
         return max(int(self.sync_interval["largest_ns"][0]), since) * 1e-9
 
     def cycle(self, most: int = 1) -> None:
-        """Do one cycle; or up to `most`, where there is nothing to be done in between.
+        """Do one cycle, or up to `most` if Python has nothing to do in between.
 
         Raises:
-            can.CanError: the bus has failed.
+            can.CanError: If the bus fails.
         """
         core = self._core
         core["writer_reads"] = self.waits_for_writer
@@ -199,7 +199,7 @@ class Exchange:
         self.transport.finish_cycle()
 
     def close(self) -> None:
-        """Give back what the transport has opened; the link stays open."""
+        """Release the resources of the transport; the link stays open."""
         self.transport.close()
 
     def _serve_python(self, want: Want) -> None:
@@ -212,7 +212,7 @@ class Exchange:
             raise SyncLostError(self._sync_patience_s)
 
     def _serve_frames(self) -> None:
-        """Log the frames that compiled code could not, and dispatch those in the inbox."""
+        """Log the frames that compiled code could not log, and dispatch those in the inbox."""
         log = self._link.log
         if log is not None:
             for frame in self._unlogged.take():
@@ -222,7 +222,7 @@ class Exchange:
             self._link.dispatch(to_message(frame, ""))
 
     def _choose_log(self) -> None:
-        """Have frames logged as the link's are: into its ring directly, else by `_serve_frames`."""
+        """Log frames where the link logs its own, directly into a ring or by `_serve_frames`."""
         core, log = self._core, self._link.log
         owner = getattr(log, "__self__", None)
         ring = owner if isinstance(owner, Ring) else self._unlogged
@@ -230,7 +230,7 @@ class Exchange:
         core["log"], core["log_length"] = ring.frames.ctypes.data, len(ring.frames)
 
     def _choose_handling(self) -> None:
-        """Leave PDOs to the log alone that nobody in Python has subscribed to."""
+        """Only log those PDOs to which nothing in Python has subscribed."""
         subscribed = self._link.network.subscribers
         if len(subscribed) != self._subscribed:
             self._subscribed = len(subscribed)
@@ -278,7 +278,7 @@ def _lay_out(axis: WallAxis) -> None:
 
 
 def _handling(axes: Sequence[WallAxis]) -> NDArray[np.uint8]:
-    """Return how frames are handed over, by CAN-ID: those that may end a wall at once."""
+    """Return the handling of frames by CAN-ID; those that may end a wall are urgent."""
     handling = np.zeros(0x800, np.uint8)
     handling[axes[0].setup.sync_cob_id] = Handling.URGENT
     for axis in axes:
@@ -288,9 +288,9 @@ def _handling(axes: Sequence[WallAxis]) -> NDArray[np.uint8]:
 
 
 def error_control_periods_ns(watchdogs: Iterable[Watchdog]) -> dict[ErrorControlFrame, int]:
-    """Return the frames that these watchdogs wait for, and how often each is sent [ns].
+    """Return the frames that these watchdogs expect, and the period of each [ns].
 
-    Drives that consume the same heartbeat get it as often as the shortest one wants.
+    Drives that consume the same heartbeat get it with the shortest of their periods.
     """
     periods: dict[ErrorControlFrame, float] = {}
     for watchdog in watchdogs:
@@ -311,8 +311,8 @@ def _error_control_frames(watchdogs: Iterable[Watchdog]) -> NDArray[np.void]:
 
 
 def _warm_up(axis: WallAxis) -> None:
-    # What is compiled is loaded at its first call, which takes longer than many a cycle; the laws
-    # are called by address, and not by the core's own loading.
+    # Compiled code is loaded at its first call, which may take longer than a cycle. The laws are
+    # called by address, so loading the core does not load them.
     cycle, row = axis.cycle.copy(), axis.row.copy()
     for phase in Phase:
         cycle["phase"] = phase

@@ -108,7 +108,7 @@ class RunFolder:
 
     @property
     def signals(self) -> Path:
-        """Path of the signals: one row per cycle (Parquet)."""
+        """Path of the signals, one row per cycle (Parquet)."""
         return self.path / "signals.parquet"
 
     @property
