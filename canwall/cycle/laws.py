@@ -1,4 +1,4 @@
-"""The laws by which one run may render its wall."""
+"""Laws by which a run may render its wall."""
 
 from pathlib import Path
 from typing import Any
@@ -11,8 +11,8 @@ from canwall.walls import DEADBEAT, Law, UnknownLawError, find_law
 def run_laws(settings: Settings) -> list[Law]:
     """Return the laws of the run, each once, in the order in which they are first used.
 
-    They are compiled here, before any drive waits for it. Raises ConfigError for a law that does
-    not exist, does not compile, or does not have the options given.
+    They are compiled here, so that no drive has to wait for it. Raises ConfigError for a law that
+    does not exist, does not compile, or does not have the given options.
     """
     laws: dict[str, Law] = {}
     walls = [wall for stage in settings.stages for wall in settings.laws_in_turn(stage.wall)]
@@ -36,12 +36,12 @@ def run_laws(settings: Settings) -> list[Law]:
 
 
 def with_law(settings: Settings, law: str) -> Settings:
-    """Return the settings with the wall rendered by that law (`<law>+deadbeat`: compensated)."""
+    """Return the settings with another law; `<law>+deadbeat` adds the deadbeat compensation."""
     name = absolute_law(law, Path())
     deadbeat = name.endswith(DEADBEAT)
     wall: dict[str, Any] = {"law": name.removesuffix(DEADBEAT), "deadbeat": deadbeat}
     if name != named_law(settings):
-        wall["options"] = {}  # they were the other law's
+        wall["options"] = {}  # options belong to the previous law
     return settings.model_copy(update={"wall": settings.wall.model_copy(update=wall)})
 
 

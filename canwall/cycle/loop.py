@@ -1,9 +1,9 @@
-"""The loop: enable, render, leave. One way in and one way out, whatever happens in between.
+"""Loop of a run: enable, render, leave, with a single way out whatever happens in between.
 
-Every exit (time is up, Ctrl-C, a trip, an exception, a bus that fails) goes through `_leave`:
-torque zero from the very next RPDO, then the CiA 402 state machine down to SWITCH ON DISABLED, and
-only then the drive's watchdog off, which would miss its master.
-With several axes, what ends one ends all.
+Every exit (end of the run, Ctrl-C, a trip, an exception, failure of the bus) goes through `_leave`:
+zero torque from the very next RPDO, then the CiA 402 state machine down to SWITCH ON DISABLED, and
+only then the drive's watchdog off, which would otherwise report the loss of its master.
+With several axes, the end of one ends all.
 """
 
 import gc
@@ -38,12 +38,12 @@ _ENABLE_CYCLES = 2000
 _LEAVE_S, _LEAVE_CYCLES = 0.1, 20
 #: Cycles without a TPDO after which a drive counts as silent while enabling and leaving.
 _SILENT_CYCLES = 50
-#: SYNCs in which a drive that does not follow its RPDOs may still hear of its end from them.
+#: SYNCs with RPDOs that disable a drive although it no longer seems to follow them.
 _LAST_RPDOS = 5
-#: States in which a drive gives no torque until it is enabled anew.
+#: States in which a drive gives no torque until it is enabled again.
 _DISABLED = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
-#: Cycles before enabling in which position and statusword have to arrive; in real time no less
-#: than so long [s]: either process may have other things to do.
+#: Cycles before enabling within which position and statusword have to arrive, and the least time
+#: in real time [s], in which master or drive may be delayed.
 _FIRST_CYCLES, _FIRST_S = 10, 0.2
 
 
@@ -55,14 +55,14 @@ class Outcome:
     interrupted: bool = False
     trips: list[str] = field(default_factory=list)
     trip_cycle: int | None = None
-    """The cycle at which a limit was passed, or a report ended the wall."""
+    """Cycle at which a limit was exceeded, or a report ended the wall."""
     disabled: bool = False
     notes: list[str] = field(default_factory=list)
-    """Steps of the way out that the drives refused though they are disabled."""
+    """Steps of the way out that the drives refused, although they are disabled."""
 
 
 class WallGivenUpError(RunFailedError):
-    """A wall that was given up; the text gives the reason."""
+    """End of a wall before its time; the text gives the reason."""
 
 
 def run_loop(
@@ -71,13 +71,17 @@ def run_loop(
     stop: Callable[[], bool],
     progress: Callable[[int], None] = lambda j: None,
 ) -> Outcome:
-    """Enable the drives, render the walls for `cycles` SYNCs (None: until stopped), disable them.
+    """Enable the drives, render the walls, disable the drives.
 
-    stop is polled once a cycle; progress gets the cycle about every 100 ms of bus time.
+    Args:
+        exchange: Exchange of frames with the drives.
+        cycles: Number of SYNCs with the wall rendered, None for a run until it is stopped.
+        stop: Called once a cycle; True ends the run.
+        progress: Called with the cycle about every 100 ms of bus time.
     """
     outcome = Outcome()
     loop = Loop(exchange, stop, progress)
-    # A collection would stop the cycle for milliseconds; nothing in it makes reference cycles.
+    # A collection would stop the cycle for milliseconds; the loop creates no reference cycles.
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -103,7 +107,7 @@ def run_loop(
 
 
 def _leave(loop: "Loop", outcome: Outcome) -> None:
-    """Disable by the cycle; by SDO where that failed or a trip leaves doubt; by NMT at last."""
+    """Disable by RPDO; over SDO if that fails or a trip leaves doubt; as a last resort by NMT."""
     try:
         outcome.disabled = loop.leave()
         if outcome.disabled and not outcome.trips:
@@ -126,7 +130,7 @@ def _leave(loop: "Loop", outcome: Outcome) -> None:
 
 
 class Loop:
-    """The parts of a run: enable, render, leave; whoever enables has to leave."""
+    """Parts of a run: enable, render, leave. A caller that enables has to leave."""
 
     def __init__(
         self,
@@ -142,14 +146,14 @@ class Loop:
         self._progress_every = max(1, round(0.1 / self._period))
         self._delay_tests = []
         if any(axis.measures_delay for axis in self._axes):
-            # SciPy's optimizer takes some tenths of a second to load: before the first SYNC.
+            # SciPy's optimizer takes some tenths of a second to load, so load it before any SYNC.
             from canwall.cycle.delay import DelayTest
 
             self._delay_tests = [DelayTest(axis) for axis in self._axes if axis.measures_delay]
 
     @property
     def j(self) -> int:
-        """Cycles so far."""
+        """Number of cycles so far."""
         return int(self._axes[0].cycle["j"][0])
 
     def _enter(self, phase: Phase) -> None:
@@ -162,7 +166,7 @@ class Loop:
     def enable(self) -> None:
         """Take the state machines up to OPERATION ENABLED with zero torque.
 
-        Raises WallGivenUpError where a drive does not follow.
+        Raises WallGivenUpError if a drive does not follow.
         """
         self._enter(Phase.ENABLING)
         self._first_positions()
@@ -203,14 +207,14 @@ class Loop:
             start_at(axis.cycle, int(axis.cycle["counts"][0]))
 
     def render(self, cycles: int | None) -> bool:
-        """Render the walls until time is up; return whether it was stopped before.
+        """Render the walls for the given cycles; return True if stopped before their end.
 
         Raises WallGivenUpError at a trip.
         """
         if self._stop() or self._measure_delays():
             return True
         for axis in self._axes:
-            # The handle may be inside the wall: its force comes up without a kick.
+            # The handle may be inside the wall, so the force fades in.
             fade_in(axis.cycle, round(axis.settings.run.ramp_in_s / self._period))
         self._enter(Phase.RENDERING)
         pending = [(axis, list(axis.changes)) for axis in self._axes]
@@ -226,20 +230,20 @@ class Loop:
         return False
 
     def _most(self, cycles: int | None, pending: list[tuple[WallAxis, list[WallStage]]]) -> int:
-        """Return the cycles until the end, the next report of progress, or the next change."""
+        """Return the number of cycles to the end, the next progress report or the next change."""
         ends = [self.j + self._exchange.ahead]
         ends.append((self.j // self._progress_every + 1) * self._progress_every)
         if cycles is not None:
             ends.append(cycles)
         for axis, changes in pending:
             ends += [change.j for change in changes[:1]]
-            # A change that is due waits for the one before to be complete.
+            # A change waits until the previous one is complete.
             if fading := int(axis.cycle["fade_left"][0]):
                 ends.append(self.j + fading)
         return max(1, min(ends) - self.j)
 
     def _measure_delays(self) -> bool:
-        """Measure the delay of the axes that ask for it; return whether it was stopped before."""
+        """Measure the delay of the axes that need it; return True if stopped before the end."""
         tests = self._delay_tests
         if not tests:
             return False
@@ -268,10 +272,10 @@ class Loop:
                 raise WallGivenUpError(self._say(axis, trip_text(axis, self._exchange)))
 
     def leave(self) -> bool:
-        """Take the state machines down with zero torque; return whether the drives confirmed it."""
+        """Take the state machines down with zero torque; return True if the drives confirm it."""
         self._enter(Phase.LEAVING)
         if any(axis.cycle["trip"][0] == Trip.MISSED_TPDO for axis in self._axes):
-            # The drive may hear though it is not heard: quick stop, whatever its state.
+            # A silent drive may still receive: command a quick stop, whatever its state.
             for axis in self._axes:
                 axis.cycle["controlword"] = Controlword.QUICK_STOP
             self._exchange.cycle()
@@ -289,7 +293,7 @@ class Loop:
         return False
 
     def disable_over_sdo(self) -> None:
-        """Disable the drives over SDO. Raises DriveError, after all were asked."""
+        """Disable the drives over SDO. Raises DriveError after an attempt with each of them."""
         failed: DriveError | None = None
         for axis in self._axes:
             try:
@@ -301,7 +305,7 @@ class Loop:
             raise failed
 
     def disarm(self) -> list[str]:
-        """Switch the watchdogs off; return a line for each drive that refuses."""
+        """Switch the watchdogs off; return one line for each drive that refuses."""
         refused = []
         for axis in self._axes:
             try:
@@ -312,7 +316,7 @@ class Loop:
         return refused
 
     def reset(self) -> bool:
-        """Send NMT RESET NODE, after which a drive gives no torque; return whether it was sent."""
+        """Send NMT RESET NODE, which ends any torque of the drives; return True if it was sent."""
         try:
             for axis in self._axes:
                 axis.node.command("RESET")
@@ -322,7 +326,7 @@ class Loop:
 
 
 def _change(axis: WallAxis, changes: list[WallStage], period: float) -> None:
-    """Change wall and limits where it is time to, each change once the one before is complete."""
+    """Apply the changes of wall and limits that are due, each after the previous is complete."""
     cycle, mailbox = axis.cycle, axis.mailbox
     if cycle["fade_left"][0]:
         return
@@ -342,7 +346,7 @@ def _change(axis: WallAxis, changes: list[WallStage], period: float) -> None:
     if mailbox is not None and mailbox.waiting():
         posted = config.WallChange.model_validate_json(mailbox.take(j))
         axis.wall, axis.limits = posted.applied_to(axis.wall, axis.limits)
-        # A law that was asked for ends the turns; all else holds for the walls in turn as well.
+        # A requested law ends the alternation; other changes apply to all alternating walls.
         walls = [axis.wall] if posted.law else axis.turns
         axis.turns = [posted.applied_to(wall, axis.limits)[0] for wall in walls]
     set_wall(cycle, axis.wall, axis.laws)
@@ -350,14 +354,14 @@ def _change(axis: WallAxis, changes: list[WallStage], period: float) -> None:
 
 
 def _advance_enabling(axis: WallAxis, way: Enabling) -> bool:
-    """Set the controlword that leads to OPERATION ENABLED; return whether the drive shows it."""
+    """Set the controlword towards OPERATION ENABLED; return True once the drive is in it."""
     statusword = int(axis.cycle["statusword"][0])
     axis.cycle["controlword"] = way.next(statusword)
     return state_of(statusword) is DriveState.OPERATION_ENABLED
 
 
 def _is_down(axis: WallAxis) -> bool:
-    """Return whether the drive has shown, since it is being left, that it gives no torque."""
+    """Return True if the drive, since the loop began to leave, has reported no torque."""
     state = state_of(int(axis.cycle["statusword"][0]))
     return state in _DISABLED and bool(axis.row["phase"][0] == Phase.LEAVING)
 

@@ -1,7 +1,7 @@
-"""Set-up of the machine for a cycle that keeps to the clock, as far as the process may.
+"""Set-up of the machine for a cycle in real time, as far as the process has permission.
 
-Besides the priority of the loop's thread (`realtime`): locked memory, no deep idle states,
-processor affinity, and a short switch interval for other Python threads.
+Besides the priority of the loop's thread (`realtime`), it covers locked memory, idle states,
+processor affinity, and the switch interval of other Python threads.
 """
 
 import ctypes
@@ -14,9 +14,9 @@ from pathlib import Path
 
 from canwall.cycle.realtime import Grant, limits_line, real_time_priority
 
-#: sys/mman.h. Only pages that are used are locked: libraries map far more than they touch.
+#: sys/mman.h. Only touched pages are locked, because libraries map far more than they use.
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
-#: Whoever holds this file open limits the time that a processor may take to wake up.
+#: While open, this file limits the wake-up latency of the processors.
 _WAKE_UP = Path("/dev/cpu_dma_latency")
 _UDEV_RULE = (
     "in /etc/udev/rules.d/99-cpu-dma-latency.rules, for a group that you are in: "
@@ -28,10 +28,10 @@ _SWITCH_INTERVAL_S = 1e-4
 
 @contextmanager
 def real_time_machine(processor: int | None = None) -> Iterator[dict[str, Grant]]:
-    """Take everything that the process may have; yield what was granted, and how to get the rest.
+    """Set the machine up as far as permitted; yield what was granted, and how to get the rest.
 
-    processor: the one that the loop's thread stays on, perhaps one that isolcpus keeps free.
-    Everything is put back at the end.
+    processor: processor for the loop's thread, e.g. one that isolcpus keeps free. All settings are
+    restored at the end.
     """
     interval = sys.getswitchinterval()
     sys.setswitchinterval(min(interval, _SWITCH_INTERVAL_S))

@@ -24,7 +24,7 @@ class PythonCanTransport:
     name = "python-can"
 
     def __init__(self, link: Link, core: NDArray[np.void], frames: CycleFrames) -> None:
-        """Prepare a message for each of the frames that are sent."""
+        """Prepare a message for each of the frames to be sent."""
         self._link = link
         self._core = core
         self._out = core["out"][0]
@@ -32,13 +32,13 @@ class PythonCanTransport:
         self._messages = {can_id: _message(can_id) for can_id in frames.sent}
         #: True if messages carry the kernel's time stamp (CLOCK_REALTIME).
         self._stamped = type(link.bus).__module__.startswith("can.interfaces.socketcan")
-        # What is compiled is loaded at its first call, which takes longer than many a cycle.
+        # Compiled code is loaded at its first call, which may take longer than a cycle.
         scratch = core.copy()
         scratch["handling"] = Handling.LOG_ONLY
         take(scratch, 0, 0, 0, 0, 0)
 
     def run(self) -> Want:
-        """Move frames until Python is wanted. Raises can.CanError where the bus fails."""
+        """Move frames until the core wants Python. Raises can.CanError if the bus fails."""
         core, link = self._core, self._link
         now_ns = time.perf_counter_ns
         want = proceed(core, now_ns())
@@ -84,10 +84,10 @@ class PythonCanTransport:
         return take(self._core, can_id, length, number, time.perf_counter_ns(), stamp_ns)
 
     def finish_cycle(self) -> None:
-        """Do nothing: all frames come by the bus."""
+        """Do nothing, since all frames arrive on the bus of the link."""
 
     def close(self) -> None:
-        """Do nothing: the link stays open."""
+        """Do nothing, since the link stays open."""
 
 
 def _message(can_id: int) -> can.Message:

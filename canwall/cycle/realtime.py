@@ -1,4 +1,4 @@
-"""Real-time scheduling of the thread that runs the loop, where the process may have it."""
+"""Real-time scheduling of the loop's thread, if the process has permission."""
 
 import contextlib
 import getpass
@@ -8,19 +8,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
 
-#: Above what has no such priority, below the kernel's own interrupt threads (50).
+#: Priority above all normal threads and below the kernel's interrupt threads (50).
 _PRIORITY = 45
 
 
 class Grant(NamedTuple):
-    """One thing granted, in words, and how to get more (empty: nothing is missing)."""
+    """One granted resource in words, and how to get more (empty if nothing is missing)."""
 
     found: str
     advice: str = ""
 
 
 def limits_line(item: str, value: object) -> str:
-    """Return the line of limits.conf that allows it to this user from the next login on."""
+    """Return the line of limits.conf that grants a limit to this user from the next login on."""
     try:
         user = getpass.getuser()
     except (KeyError, OSError):  # a user without a name
@@ -32,8 +32,8 @@ def limits_line(item: str, value: object) -> str:
 def real_time_priority() -> Iterator[Grant]:
     """Run the calling thread under SCHED_FIFO; yield what was granted.
 
-    Threads and processes that it starts do not inherit the priority. Where RLIMIT_RTPRIO allows
-    less than the full priority, that is taken; without permission the scheduling stays as it is.
+    Threads and processes that it starts do not inherit the priority. If RLIMIT_RTPRIO allows only
+    a lower priority, that one is used; without permission the scheduling stays unchanged.
     """
     before, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
     granted = _raise_priority()
@@ -48,12 +48,12 @@ def real_time_priority() -> Iterator[Grant]:
         try:
             os.sched_setscheduler(0, before, parameters)
         except PermissionError:
-            # Who is not privileged cannot take back that children start without priority.
+            # An unprivileged process cannot clear SCHED_RESET_ON_FORK again.
             os.sched_setscheduler(0, before | os.SCHED_RESET_ON_FORK, parameters)
 
 
 def _raise_priority() -> int:
-    """Take the highest priority that is allowed and return it; 0: none is."""
+    """Set the highest priority that is allowed and return it, 0 if none is."""
     soft, hard = resource.getrlimit(resource.RLIMIT_RTPRIO)
     if soft != hard:
         resource.setrlimit(resource.RLIMIT_RTPRIO, (hard, hard))

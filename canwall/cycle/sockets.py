@@ -1,4 +1,4 @@
-"""Transport over a socket, compiled: SocketCAN, `unixcan`, a socket pair; no interpreter lock."""
+"""Compiled transport over a socket (SocketCAN, `unixcan`, a socket pair), without the GIL."""
 
 from collections.abc import Callable
 from typing import Any
@@ -29,11 +29,11 @@ from canwall.cycle.core import CORE, Want, proceed, take
 from canwall.cycle.transport import CycleFrames
 from canwall.drive import Link
 
-#: A drive that answers within this time after it was asked is polled for, which costs less than a
-#: sleep.
+#: Time after a request during which the socket is polled: for a fast drive, polling costs less
+#: than a sleep.
 POLL_NS = 30_000
-#: A full transmit buffer is waited for no longer than this in simulated time, and so much of a
-#: cycle in real time.
+#: Longest wait for a full transmit buffer: in simulated time [s], and as a share of the cycle in
+#: real time.
 _SEND_PATIENCE_S, _SEND_SHARE = 1.0, 0.2
 
 #: Results of `_run` besides a `Want`: the idle function has to be called in Python; the other side
@@ -50,9 +50,9 @@ SOCKET = np.dtype(
         ("stamped", "?"),
         ("send_patience_ns", "i8"),
         ("poll_ns", "i8"),
-        # A drive that is served in idle time: by Python, or by a C function at an address.
+        # Drive that is served in idle time, by Python or by a C function at an address.
         ("idle", "?"),
-        ("idled", "?"),  # in Python, since the socket was last looked at
+        ("idled", "?"),  # in Python, since the socket was last read
         ("idle_function", "u8"),
         ("idle_state", "u8"),
     ],
@@ -74,7 +74,7 @@ class SocketTransport:
         """Open the socket.
 
         Raises:
-            can.CanInitializationError: the bus has no such socket.
+            can.CanInitializationError: If the bus has no such socket.
         """
         self._link = link
         self._core = core
@@ -91,7 +91,7 @@ class SocketTransport:
 
     @property
     def poll_ns(self) -> int:
-        """Time for which frames are polled for before the wait is a sleep [ns]."""
+        """Time of polling for frames before the wait becomes a sleep [ns]."""
         return int(self._socket["poll_ns"][0])
 
     @poll_ns.setter
@@ -100,7 +100,7 @@ class SocketTransport:
 
     @property
     def descriptor(self) -> int:
-        """Descriptor that the frames of the cycle go through."""
+        """Descriptor of the socket that carries the frames of the cycle."""
         return int(self._socket["descriptor"][0])
 
     @descriptor.setter
@@ -108,7 +108,7 @@ class SocketTransport:
         self._socket["descriptor"] = descriptor
 
     def run(self) -> Want:
-        """Move frames until Python is wanted. Raises can.CanError where the bus fails."""
+        """Move frames until the core wants Python. Raises can.CanError if the bus fails."""
         link, socket = self._link, self._socket
         socket["idle"], socket["idled"] = link.idle is not None, False
         socket["idle_function"], socket["idle_state"] = link.compiled_idle or CFunction(0, 0)
@@ -125,19 +125,19 @@ class SocketTransport:
         return Want(result)
 
     def finish_cycle(self) -> None:
-        """Hand over what came to the bus beside the socket of the cycle."""
+        """Hand over frames that the bus received outside the socket of the cycle."""
         if self._cycle_socket.own:
             while self._link.serve(0.0):
                 pass
 
     def close(self) -> None:
-        """Close the socket of the cycle, where it has one of its own."""
+        """Close the socket of the cycle if it is separate from that of the bus."""
         self._cycle_socket.close()
 
 
 @intrinsic  # type: ignore[untyped-decorator]
 def _call_idle(typingctx: Any, address: Any, state: Any) -> Any:
-    """Call the compiled idle function at `address`; 0 where Python's has to be called."""
+    """Call the compiled idle function at `address`; it returns 0 if Python's has to be called."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         number = ir.IntType(64)
@@ -149,7 +149,7 @@ def _call_idle(typingctx: Any, address: Any, state: Any) -> Any:
 
 @compiled
 def _run(cores: NDArray[np.void], sockets: NDArray[np.void]) -> int:
-    """Do what the core wants until that is something of Python's; a `Want`, or as above."""
+    """Serve the core until it wants Python; return a `Want` or one of the results above."""
     core: Record = cores[0]
     socket: Record = sockets[0]
     port = socket.port[0]

@@ -1,6 +1,6 @@
-"""The record of one wall on one drive: settings, state and results, and what sets them.
+"""Record of one wall on one drive (settings, state and results), and functions that set it.
 
-The step (`step.py`) works on it; what is set here is set between two cycles.
+The step (`step.py`) works on it; the functions here are for use between two cycles.
 """
 
 import math
@@ -26,22 +26,22 @@ from canwall.walls import (
     set_referent,
 )
 
-#: Laws among which a run can change.
+#: Largest number of laws in a run.
 MAX_LAWS = 16
 
 #: Delay of a torque carried by a synchronous RPDO (theory, section 3).
 SYNCHRONOUS_DELAY = 1.0
 
-#: A coarse encoder rests on one count for long: less than so many counts are no motion missed.
+#: Missed motion below this is ignored, since a coarse encoder stays on one count for long [counts].
 _STUCK_COUNTS = 8
-#: Rounding may be a count on either side of a cycle.
+#: Tolerance for rounding, one count at each end of a cycle.
 _JUMP_COUNTS = 2
-#: Without [limits] torque_error_nm: parts of torque_nm, and per mille of the rated torque.
+#: Defaults of [limits] torque_error_nm: part of torque_nm, and per mille of the rated torque.
 _TORQUE_ERROR_PART, _TORQUE_ERROR_PER_MILLE = 0.1, 50.0
 
 _FIELD = [("shift", "i8"), ("bits", "i8")]
 
-#: No law: a wall that is not there and gives no force.
+#: No law: the wall is absent and gives no force.
 NO_LAW = -1
 
 #: A wall on the drive's axis, and the law that renders it.
@@ -50,9 +50,9 @@ RENDERED = np.dtype(
         ("law", "i8"),  # index into the laws of the cycle
         ("position", "f8"),
         ("estimated_velocity", "?"),
-        ("divider", "i8"),  # the law is asked every so many cycles
+        ("divider", "i8"),  # cycles from one evaluation of the law to the next
         ("wall", WALL, (1,)),
-        # DriveState: cycles since the law was asked, its force, its sample, the time since then.
+        # DriveState: cycles since the law was evaluated, its force, its sample, the time since.
         ("waited", "i8"),
         ("force", "f8"),
         ("y_before", "f8"),
@@ -64,7 +64,7 @@ RENDERED = np.dtype(
 #: Settings, state and results of one wall on one drive.
 CYCLE = np.dtype(
     [
-        # Where the values lie in the frames' data; bits = 0: not carried.
+        # Positions of the values in the frames' data; bits = 0: not carried.
         ("in_position", _FIELD, (1,)),
         ("in_statusword", _FIELD, (1,)),
         ("in_torque", _FIELD, (1,)),
@@ -89,7 +89,7 @@ CYCLE = np.dtype(
         ("hold_cycles", "i8"),
         ("ramp_cycles", "i8"),
         ("strike_gap", "i8"),
-        # The wall, and the one that it takes over from, cycle by cycle.
+        # The wall, and the previous one while they are blended.
         ("orientation", "f8"),
         ("laws", "u8", (MAX_LAWS,)),
         ("rendered", RENDERED, (1,)),
@@ -97,7 +97,7 @@ CYCLE = np.dtype(
         ("fade_cycles", "i8"),
         ("fade_left", "i8"),
         ("estimator", ESTIMATOR, (1,)),
-        # What the loop asks for.
+        # Requests of the loop.
         ("phase", "i8"),
         ("controlword", "i8"),
         ("test_per_mille", "i8"),
@@ -108,17 +108,17 @@ CYCLE = np.dtype(
         ("torque_actual", "i8"),
         ("torque_per_mille", "i8"),
         ("missed_in_a_row", "i8"),
-        # Whether the estimator knows where the handle is, and how far off it was this time.
+        # True once the estimator has a position; its last prediction error.
         ("started", "?"),
         ("innovation", "f8"),
-        # Cycles since the position last changed, its last changes before [counts per cycle], and
-        # how much farther the handle should have gone that way in them [rad].
+        # Cycles since the position last changed, the last two changes [counts per cycle], and the
+        # travel in that direction that the model has predicted since [rad].
         ("frozen", "i8"),
         ("change", "i8"),
         ("change_before", "i8"),
         ("motion_missed", "f8"),
-        # Highest and lowest torque commanded of late [per mille]; cycles for which the torque
-        # actual value has been outside of them, and how far [N·m].
+        # Highest and lowest recently commanded torque [per mille]; cycles for which the torque
+        # actual value has been outside this range, and by how much [N·m].
         ("highest_sent", "f8"),
         ("lowest_sent", "f8"),
         ("unfollowed", "i8"),
@@ -138,10 +138,10 @@ CYCLE = np.dtype(
 
 
 def make_cycle(settings: Settings, setup: DriveSetup, laws: Sequence[Law]) -> NDArray[np.void]:
-    """The record of one wall, ready for its first cycle; shape (1,), dtype CYCLE.
+    """Return the record of one wall, ready for its first cycle; shape (1,), dtype CYCLE.
 
-    `laws` are the laws of the run; a row's `law` is an index into them. Raises UnknownLawError
-    for options that a law does not have.
+    `laws` are the laws of the run; the `law` in a row is an index into them. Raises
+    UnknownLawError for options that a law does not have.
     """
     cycle = np.zeros(1, CYCLE)
     for name, layout, index in (
@@ -170,13 +170,13 @@ def make_cycle(settings: Settings, setup: DriveSetup, laws: Sequence[Law]) -> ND
 
 
 def _model(settings: Settings) -> tuple[float, float, float]:
-    """Mass, viscous damping and spring of `[mechanics]`."""
+    """Return mass, viscous damping and spring of `[mechanics]`."""
     mechanics = settings.mechanics
     return mechanics.inertia_kg_m2, mechanics.viscous_nm_s_per_rad, mechanics.spring_nm_per_rad
 
 
 def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None:
-    """Write the estimator for a delay of `delay` periods; it starts anew. Raises ValueError."""
+    """Reset the estimator for a delay of `delay` periods. Raises ValueError."""
     set_estimator(
         cycle["estimator"][0],
         *_model(settings),
@@ -219,7 +219,7 @@ def set_limits(cycle: NDArray[np.void], limits: Limits) -> None:
 
 
 def set_wall(cycle: NDArray[np.void], wall: Wall, laws: Sequence[Law]) -> None:
-    """Change the wall between two cycles; its law is one of `laws`. Raises UnknownLawError."""
+    """Change the wall between two cycles; `laws` contains its law. Raises UnknownLawError."""
     law = find_law(wall.law, wall.deadbeat)
     options = law.option_values(wall.options)
     index = [known.name for known in laws].index(law.name)
@@ -229,7 +229,7 @@ def set_wall(cycle: NDArray[np.void], wall: Wall, laws: Sequence[Law]) -> None:
     rendered["position"] = wall.position_rad
     rendered["estimated_velocity"] = wall.velocity == "estimated"
     if wall.divider != rendered["divider"]:
-        # The law's torques are held for as long as it is not asked again.
+        # The law's torques are held until it is evaluated again.
         rendered["divider"] = rendered["waited"] = wall.divider
         mass, viscous, spring = (known[name].item() for name in ("mass", "viscous", "spring"))
         set_plant(known, mass, viscous, spring, cycle["period"].item() * wall.divider)
@@ -242,23 +242,22 @@ def set_wall(cycle: NDArray[np.void], wall: Wall, laws: Sequence[Law]) -> None:
 
 
 def fade_over(cycle: NDArray[np.void], cycles: int) -> None:
-    """Let the wall as it is now give way to what is set next, without a bump, within `cycles`.
+    """Blend the present wall into the next one without a bump, within `cycles`.
 
-    To be called before `set_wall`. Force and wall change places linearly; where neither gives a
-    force there is nothing to fade.
+    To be called before `set_wall`. The forces of both walls are blended linearly.
     """
     cycle["faded"] = cycle["rendered"]
     cycle["fade_cycles"] = cycle["fade_left"] = cycles
 
 
 def fade_in(cycle: NDArray[np.void], cycles: int) -> None:
-    """Let the wall come up out of nothing within `cycles`: the handle may be inside it."""
+    """Fade the wall in from zero force within `cycles`, since the handle may be inside it."""
     fade_over(cycle, cycles)
     cycle["faded"]["law"] = NO_LAW
 
 
 def start_at(cycle: NDArray[np.void], counts: int) -> None:
-    """Begin at rest at a position: the first that the drive reports."""
+    """Begin at rest at a position, the first that the drive reports."""
     oriented = cycle["orientation"][0] * counts * cycle["rad_per_count"][0]
     reset_estimator(cycle["estimator"][0], oriented)
     cycle["oriented"] = cycle["rendered"]["y_before"] = oriented

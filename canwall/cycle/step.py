@@ -1,4 +1,4 @@
-"""One cycle between the two frames: TPDO in, RPDO out, as one compiled function over one record.
+"""One cycle from TPDO to RPDO, as one compiled function on one record.
 
 Counts → y → estimator → state at the instant of actuation → law → tension → limits → per mille.
 """
@@ -29,7 +29,7 @@ _NAN = int(Trip.NOT_A_NUMBER)
 _RENDERING = int(Phase.RENDERING)
 _MEASURING = int(Phase.MEASURING)
 
-#: After more cycles than this without a sample the estimator starts again.
+#: Cycles without a sample after which the estimator starts again.
 _BLIND_CYCLES = 5
 
 
@@ -65,8 +65,8 @@ def read_inputs(cycles: NDArray[np.void], data: int) -> None:
 def _set_wall_inputs(cycle: Record, rendered: Record, due: bool) -> None:
     """Set position, velocity and bias force relative to the wall.
 
-    The estimator works on the drive's axis, oriented towards the wall, and is not disturbed when
-    the wall is moved. due: the law will be evaluated on a new sample.
+    The estimator works on the drive's axis, oriented towards the wall, so moving the wall does not
+    disturb it. due: True if the law will be evaluated on a new sample.
     """
     wall, estimator = rendered.wall[0], cycle.estimator[0]
     origin = cycle.orientation * rendered.position
@@ -85,7 +85,7 @@ def _set_wall_inputs(cycle: Record, rendered: Record, due: bool) -> None:
 
 @compiled
 def _advance_divider(rendered: Record, received: bool) -> bool:
-    """Count the cycle; return whether the law is evaluated: every n-th, with a sample."""
+    """Count the cycle; return True if the law is due, on every n-th cycle that has a sample."""
     rendered.waited += 1
     if not received or rendered.waited < rendered.divider:
         return False
@@ -95,7 +95,7 @@ def _advance_divider(rendered: Record, received: bool) -> bool:
 
 @compiled
 def _force_of(cycle: Record, rendered: Record, due: bool) -> float:
-    """Return the force of a wall: of its law now, or when that was last evaluated."""
+    """Return the force of a wall, evaluated now or held since the last evaluation."""
     if rendered.law < 0:
         return 0.0
     if due:
@@ -119,7 +119,7 @@ def _faded_force(cycle: Record, force: float, received: bool) -> float:
 
 @compiled
 def _held_force(cycle: Record) -> float:
-    """Return the force without a TPDO: the last one, then a ramp to zero, then a trip."""
+    """Return the force without a TPDO, which is held, then ramped to zero, then ends in a trip."""
     held = cycle.orientation * cycle.torque_per_mille * cycle.nm_per_mille
     overdue = cycle.missed_in_a_row - cycle.hold_cycles
     if overdue <= 0:
@@ -147,7 +147,7 @@ def _wanted_force(cycle: Record, received: bool, due: bool) -> float:
     if not math.isfinite(force):
         cycle.trip = _NAN
         return 0.0
-    # A torque that may not change faster than this is held back, on either way.
+    # The torque rate is limited in both directions.
     before = cycle.orientation * cycle.torque_per_mille * cycle.nm_per_mille
     most = cycle.torque_rate * cycle.period
     return min(max(force, before - most), before + most)
@@ -180,9 +180,9 @@ def _account_contact(cycle: Record, received: bool) -> None:
 
 @compiled
 def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: bool) -> int:
-    """TPDO data in, RPDO data out (little-endian numbers); fills the row of this cycle.
+    """Return RPDO data for TPDO data (little-endian numbers), and fill the row of this cycle.
 
-    cycles has dtype CYCLE and shape (1,), rows ROW and (1,). Without a TPDO (`received` false)
+    cycles has dtype CYCLE and shape (1,), rows ROW and (1,). Without a TPDO (`received` False),
     data is ignored.
     """
     cycle: Record = cycles[0]

@@ -1,6 +1,6 @@
-"""Durations of the cycle in histograms of fixed size: nothing is allocated while they fill.
+"""Durations of the cycle in histograms of fixed size, filled without allocation.
 
-Buckets are as fine as 1/32 of their value (a power of two, cut into 32), from 1 ns to 16 s.
+The width of a bucket is 1/32 of an octave's lower end, from 1 ns to 16 s.
 """
 
 import numpy as np
@@ -32,7 +32,7 @@ def observe_ns(histograms: NDArray[np.void], duration_ns: int) -> None:
 
 
 def percentile_ns(histogram: NDArray[np.void], percent: float) -> float:
-    """The duration that `percent` of those counted do not exceed, to 1/32; 0 of none."""
+    """Return a percentile of the durations, to within 1/32; 0 for an empty histogram."""
     counts = histogram["counts"][0]
     total = int(counts.sum())
     if total == 0:
@@ -42,20 +42,20 @@ def percentile_ns(histogram: NDArray[np.void], percent: float) -> float:
 
 
 def buckets_ns(histogram: NDArray[np.void]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Upper ends [ns], inclusive, of the buckets that are not empty, and how many are in each."""
+    """Return the upper ends [ns], inclusive, and the counts of the buckets that are not empty."""
     used = np.flatnonzero(histogram["counts"][0])
     ends = np.array([_upper_ns(int(bucket)) for bucket in used], np.int64)
     return ends, histogram["counts"][0][used].astype(np.int64)
 
 
 def _upper_ns(bucket: int) -> int:
-    """The longest duration that is counted in a bucket."""
+    """Return the longest duration that is counted in a bucket."""
     octave = max(bucket // _SUB - 1, 0)
     return ((bucket - octave * _SUB + 1) << octave) - 1
 
 
 def timing_summary(histogram: NDArray[np.void]) -> dict[str, float]:
-    """p50, p99, p99.9 and max in microseconds."""
+    """Return p50, p99, p99.9 and max in microseconds."""
     summary = {
         f"p{percent:g}_us": percentile_ns(histogram, percent) / 1e3 for percent in (50, 99, 99.9)
     }

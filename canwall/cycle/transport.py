@@ -1,4 +1,4 @@
-"""Interface of a transport: it moves the frames of the core and sleeps, and knows no rule."""
+"""Interface of a transport, which moves the frames of the core and sleeps, without rules."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,9 +13,9 @@ from canwall.drive import Link
 
 @dataclass(frozen=True)
 class CycleFrames:
-    """Frames of a cycle: CAN-IDs, with linux/can.h's flags, that it receives and that it sends.
+    """CAN-IDs, with the flags of linux/can.h, of the frames that a cycle receives and sends.
 
-    real_time: whether they keep to the clock. period_s: of the SYNC [s].
+    real_time: True if the cycle follows the clock. period_s: period of the SYNC [s].
     """
 
     received: tuple[int, ...]
@@ -28,27 +28,27 @@ class Transport(Protocol):
     """Moves the frames of one core."""
 
     name: str
-    """Name in a summary."""
+    """Name in the summary of a run."""
 
     def run(self) -> Want:
-        """Do what the core wants until that is something of Python's (from `Want.DONE` on).
+        """Serve the core until it wants Python (`Want.DONE` and above); return that `Want`.
 
         Raises:
-            can.CanError: the bus has failed.
+            can.CanError: If the bus fails.
         """
         ...
 
     def finish_cycle(self) -> None:
-        """Dispatch the frames that came by another way than the core's."""
+        """Dispatch frames that were not received by the core."""
         ...
 
     def close(self) -> None:
-        """Give back what the transport has opened; the link stays open."""
+        """Release the resources of the transport; the link stays open."""
         ...
 
 
 TransportFactory: TypeAlias = Callable[[Link, NDArray[np.void], CycleFrames], Transport]
 """Makes the transport of a core (dtype CORE, shape (1,)) on a link.
 
-Raises can.CanInitializationError where the bus is none that it could work on.
+Raises can.CanInitializationError if it cannot work on the bus.
 """

@@ -1,4 +1,4 @@
-"""Text of a trip: what happened, when, by how much, and where to look."""
+"""Text of a trip: event, cycle, amount, and a hint for the user."""
 
 from canwall.cycle.axis import WallAxis
 from canwall.cycle.exchange import Exchange
@@ -20,7 +20,7 @@ def latest_emergency(axis: WallAxis) -> str:
 
 
 def trip_text(axis: WallAxis, exchange: Exchange) -> str:
-    """Describe the trip that is set: cycle, value, and the key of the limit."""
+    """Describe the trip with its cycle, its value and the key of the limit."""
     cycle, row = axis.cycle[0], axis.row[0]
     j = int(row["j"])
     trip = Trip(int(cycle["trip"]))
@@ -79,9 +79,9 @@ def _too_short(axis: WallAxis) -> str:
 
 
 def _pause(axis: WallAxis, exchange: Exchange) -> str:
-    """Explain a drive that has left because its master had stood still."""
+    """Explain a drive that left OPERATION ENABLED because of a pause of the master."""
     watchdog, pause_s = axis.setup.watchdog, exchange.longest_pause_s()
-    # The latest sign of life may have been a period old when the pause began.
+    # The last sign of life may have been one period old when the pause began.
     before_s = watchdog.period_s if watchdog.error_control else 0.0
     if pause_s + before_s <= watchdog.time_s:
         return ""

@@ -9,7 +9,7 @@ from canwall.walls import start_open_loop
 
 
 class Trip(IntEnum):
-    """Reason for which the wall was given up."""
+    """Reason for giving up the wall."""
 
     NONE = 0
     SPEED = 1
@@ -19,11 +19,11 @@ class Trip(IntEnum):
     NOT_A_NUMBER = 5
     ENERGY = 6
     REPORTED = 7
-    """A frame beside the cycle: EMCY, heartbeat, error frame."""
+    """A frame outside the cycle (EMCY, heartbeat, error frame)."""
     JUMP = 8
-    """A position far from where the handle can have gone since the one before."""
+    """A position that the handle cannot have reached since the previous one."""
     STUCK = 9
-    """A position that stays the same to the count though the handle is moving."""
+    """A position that does not change by a single count although the handle is moving."""
     TORQUE = 10
     """A torque actual value (0x6077) that does not follow the target torque."""
 
@@ -38,20 +38,20 @@ _STUCK = int(Trip.STUCK)
 _TORQUE = int(Trip.TORQUE)
 _LEAVING = int(Phase.LEAVING)
 _ENABLED_MASK, _ENABLED_VALUE = DriveState.OPERATION_ENABLED.value
-#: Statusword bit 11, internal limit active: the drive says itself that it gives less.
+#: Statusword bit 11, internal limit active: the drive itself reports a reduced torque.
 _INTERNAL_LIMIT = 1 << 11
-#: A handle that is stopped within two cycles, its speed along half a wave of a cosine, goes 0.82
-#: and 0.18 of its way per cycle. Below 5.5 counts per cycle the latter is less than one, unseen;
-#: the former, carried on, comes to 3.5.
+#: A handle that stops within two cycles, with a speed that falls as half a period of a cosine,
+#: travels 0.82 and 0.18 of the distance in them. Below 5.5 counts per cycle, the latter is less
+#: than one count and not observable; the former, extrapolated, yields 3.5.
 _LEAST_COUNTS = 4
-#: Torque [per mille of the rated one] with which a hand or friction may stop the handle without
-#: notice: at a hundred hertz that is done within a cycle, and the positions show no trace of it.
+#: Torque of a hand or friction [per mille of the rated torque] that may stop the handle unnoticed:
+#: at 100 Hz the stop takes less than a cycle and leaves no trace in the positions.
 _UNMODELLED = 100.0
 
 
 @compiled
 def check_limits(cycle: Record) -> None:
-    """Set the trip of a limit that is exceeded; one that is set stays."""
+    """Set the trip of a limit that is exceeded, unless a trip is already set."""
     if cycle.trip:
         return
     position = cycle.counts * cycle.rad_per_count
@@ -71,7 +71,7 @@ def check_limits(cycle: Record) -> None:
 
 @compiled
 def _is_stuck(cycle: Record) -> bool:
-    """Return whether the encoder has stopped although the handle goes on moving.
+    """Return True if the encoder has stopped although the handle is still moving.
 
     Two predictions have to agree, in direction as well: the open-loop model, which knows the
     torques but may have the wrong mass; and the extrapolation of the last two changes of the
@@ -93,8 +93,8 @@ def _is_stuck(cycle: Record) -> bool:
 def compare_position(cycle: Record, change: int, missed: int) -> None:
     """Compare the position with the one predicted; a jump trips before the estimator uses it.
 
-    The prediction follows the torques in flight and the estimated force, through `missed` cycles
-    without a sample as well. change: of the position since the last sample [counts].
+    The prediction follows the torques in flight and the estimated force, also through `missed`
+    cycles without a sample. change: change of the position since the last sample [counts].
     """
     cycle.innovation = cycle.oriented - cycle.estimator[0].y
     if missed or not cycle.started:
