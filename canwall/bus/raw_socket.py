@@ -82,7 +82,7 @@ class CFunction(NamedTuple):
 
 
 def _c_function(name: str, result: Any, *arguments: Any) -> Any:
-    """A function of the C library, for compiled code."""
+    """Return a function of the C library, for compiled code."""
     return types.ExternalFunction(name, signature(result, *arguments))
 
 
@@ -107,7 +107,7 @@ def _pointer(typingctx: Any, address: Any) -> Any:
 
 @compiled
 def elements(address: int, count: int, dtype: Any) -> Any:
-    """The array of `count` elements at an address, of a record's dtype; from compiled code only.
+    """Return the array of `count` records at an address; for calls from compiled code only.
 
     Whoever stores the address keeps the array alive.
     """
@@ -173,7 +173,7 @@ def wait_readable(port: Record, descriptor: int, timeout_ns: int) -> bool:
 
 @compiled
 def _stamp(port: Record) -> int:
-    """The kernel's time stamp in the control message [ns]; 0: there is none."""
+    """Return the kernel's time stamp in the control message [ns], 0 if there is none."""
     control = port.control
     # struct cmsghdr: length, then level and type; then one stamp, or three, the first the kernel's.
     if port.msghdr[0].control_length < 32:

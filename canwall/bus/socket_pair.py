@@ -70,6 +70,6 @@ class SocketPairBus(can.BusABC):
 
 
 def socket_pair(channel: str = "pair") -> tuple[SocketPairBus, SocketPairBus]:
-    """A bus with two ends."""
+    """Make a bus with two ends."""
     one, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     return SocketPairBus(one, channel), SocketPairBus(other, channel)

@@ -48,7 +48,7 @@ _REFUSALS = {
 
 
 def encode_frame(msg: can.Message) -> bytes:
-    """The packet of a message. Raises can.CanOperationError for what the bus cannot carry."""
+    """Convert a message to a packet. Raises can.CanOperationError if the bus cannot carry it."""
     if msg.is_fd:
         raise can.CanOperationError("unixcan carries classical CAN frames, not CAN FD")
     # The length of the data counts: canopen changes the data of a periodic message, not its DLC.
@@ -66,7 +66,7 @@ def encode_frame(msg: can.Message) -> bytes:
 
 
 def decode_frame(frame: bytes, channel: str, is_rx: bool) -> can.Message:
-    """The message of a packet that has come now."""
+    """Convert a packet received now to a message."""
     can_id, length, data = _FRAME.unpack(frame)
     return can.Message(
         timestamp=time.time(),
@@ -82,7 +82,7 @@ def decode_frame(frame: bytes, channel: str, is_rx: bool) -> can.Message:
 
 
 def prepared(sock: socket.socket) -> socket.socket:
-    """The socket, not blocking, with room for many frames that the other side has not read."""
+    """Make the socket non-blocking, with room for many unread frames, and return it."""
     sock.setblocking(False)
     # What a peer has not read counts against the sender's buffer; SO_RCVBUF has no say (unix(7)).
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)

@@ -38,7 +38,7 @@ class DriveNode:
         item = self.dictionary.get(index)
         if item is None or isinstance(item, ODVariable):
             return item is not None and subindex == 0
-        # By [] an array of canopen's would make up sub-indices that it does not have.
+        # With [], canopen's arrays would invent sub-indices that they do not have.
         return subindex in item.subindices
 
     def dcf_objects(self) -> Iterator[ODVariable]:
@@ -120,7 +120,7 @@ class DriveNode:
         return failures
 
     def command(self, nmt: str) -> None:
-        """Send an NMT command to this node, by canopen's name for it, e.g. PRE-OPERATIONAL."""
+        """Send an NMT command to this node, given by canopen's name, e.g. PRE-OPERATIONAL."""
         self._node.nmt.state = nmt
 
     def wait_until_present(self, timeout_s: float) -> None:

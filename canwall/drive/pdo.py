@@ -121,7 +121,7 @@ def configure_rpdo(
 
 @contextmanager
 def while_off(node: DriveNode, communication: int) -> Iterator[None]:
-    """Switch a PDO off for as long as the context lasts: only then may its parameters change."""
+    """Switch a PDO off for the duration of the context, so that its parameters can change."""
     cob_id = node.read(communication, 1)
     if cob_id & _INVALID:
         yield
@@ -238,7 +238,7 @@ def _read_pdos(node: DriveNode, first: int) -> Iterator[PdoLayout]:
 
 
 def tpdos_on_sync(node: DriveNode) -> list[PdoLayout]:
-    """Return all TPDOs that the drive sends with every SYNC or with some. Raises DriveError."""
+    """Return all TPDOs that the drive sends with every or some SYNCs. Raises DriveError."""
     return [
         layout
         for layout in _read_pdos(node, od.TPDO_COMMUNICATION)

@@ -130,7 +130,7 @@ def _torque_limit(node: DriveNode) -> tuple[float, str]:
 
 
 def _check_polarity(node: DriveNode) -> None:
-    """Raise DriveError if position and torque may have opposite signs: the wall would pull."""
+    """Raise DriveError if position and torque may have opposite signs, as the wall would pull."""
     if not node.has(od.POLARITY):
         return
     polarity = node.read(od.POLARITY)

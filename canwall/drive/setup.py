@@ -1,4 +1,4 @@
-"""Set-up of a drive over SDO, from whatever state it is found in to one ready for the cycle."""
+"""Set-up of a drive over SDO, from any state to readiness for the cycle."""
 
 import math
 import time

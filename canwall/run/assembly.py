@@ -23,8 +23,8 @@ from canwall.eds import load_eds
 from canwall.record import Ring
 from canwall.walls import Law
 
-#: Time for which compiled code keeps the cycle before the loop handles signals, messages and
-#: changes, in real and in simulated time [s of bus time].
+#: Time for which compiled code runs cycles before the loop handles signals, messages and changes,
+#: in real and in simulated time [s of bus time].
 _NATIVE_SPAN_S, _SIMULATED_NATIVE_SPAN_S = 0.02, 1.0
 
 
@@ -121,8 +121,8 @@ def render(
 def restoring_drives() -> Iterator[tuple[list[WallAxis], dict[str, list[str]]]]:
     """Undo the changes in the drives at the end, for each with `[drive] restore`.
 
-    Yields a list to fill with the axes, and a dictionary that will have, by name of the axis, what
-    could not be undone.
+    Yields a list to fill with the axes, and a dictionary that will hold, by name of the axis, the
+    changes that could not be undone.
     """
     axes: list[WallAxis] = []
     failures: dict[str, list[str]] = {}
@@ -135,7 +135,7 @@ def restoring_drives() -> Iterator[tuple[list[WallAxis], dict[str, list[str]]]]:
 
 
 def prepared_machine(settings: Settings) -> AbstractContextManager[dict[str, Grant]]:
-    """Prepare the machine for a run in real time; the context is what it granted."""
+    """Prepare the machine for a run in real time; the context yields what was granted."""
     if settings.real_time:
         return real_time_machine(settings.bus.processor)
     return nullcontext({"scheduling": Grant("simulated time")})

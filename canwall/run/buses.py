@@ -17,7 +17,7 @@ def open_bus(settings: Settings) -> can.BusABC:
     """Open the bus of `[bus]`.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: If the bus does not exist.
     """
     bus = settings.bus
     try:
@@ -38,12 +38,12 @@ def make_simulated_drive(
     """Make the drive of `[simulation]`, from the dictionary of `[drive]`.
 
     Args:
-        settings: of the run.
-        report: called with a line when one of its faults begins or ends.
+        settings: Configuration of the run.
+        report: Called with a line when a fault begins or ends.
 
     Raises:
-        ConfigError: there is no `[simulation]`.
-        DictionaryError: the dictionary is of no use.
+        ConfigError: If there is no `[simulation]`.
+        DictionaryError: If the dictionary cannot be used.
     """
     if settings.simulation is None:
         raise ConfigError("[simulation] is missing: there is no drive to simulate")
@@ -59,17 +59,17 @@ def serve_drive(
     joined: Callable[[], None],
     report: Callable[[str], None] = lambda line: None,
 ) -> None:
-    """Serve a simulated drive alone on its bus, until stopped (`canwall drive`).
+    """Run a simulated drive on its bus until stopped (`canwall drive`).
 
     Args:
-        settings: of the drive.
-        stop: asked every millisecond or more often.
-        joined: called when the drive hears what is on the bus.
-        report: called with a line when a fault begins or ends, or the bus goes or comes back.
+        settings: Configuration of the drive.
+        stop: Called every millisecond or more often; True ends the drive.
+        joined: Called once the drive receives from the bus.
+        report: Called with a line when a fault begins or ends, or the bus goes or comes back.
     """
     drive = make_simulated_drive(settings, report)
     with open_bus(settings) as bus:
-        # A controller makes its own error frames; given one, it sends it as data.
+        # A real controller generates error frames itself; given one, it sends it as data.
         virtual = settings.bus.interface == "unixcan" or settings.bus.channel.startswith("vcan")
         runner = simdrive.BusRunner(drive, bus, error_frames=virtual, report=report)
         joined()
@@ -78,15 +78,15 @@ def serve_drive(
 
 @contextmanager
 def on_the_bus(*many: Settings) -> Iterator[Link]:
-    """Open a link to the bus; embedded drives live on the same bus, in the master's idle time.
+    """Open a link to the bus; embedded drives run on the same bus, in the master's idle time.
 
-    One embedded drive is at the other end of a socket pair, where compiled code exchanges its
-    frames (`bus.exchange`); several, and others that python-can's virtual bus is to carry, on that.
+    A single embedded drive is at the other end of a socket pair if compiled code exchanges its
+    frames (`bus.exchange`). Otherwise embedded drives are on python-can's virtual bus.
 
     Raises:
-        ConfigError: there is no such bus.
-        DictionaryError: a drive's dictionary is of no use.
-        DriveError: another master is on the bus.
+        ConfigError: If the bus does not exist.
+        DictionaryError: If the dictionary of a drive cannot be used.
+        DriveError: If another master is on the bus.
     """
     if not many[0].embedded:
         with open_bus(many[0]) as bus:
@@ -99,7 +99,7 @@ def on_the_bus(*many: Settings) -> Iterator[Link]:
     with ExitStack() as stack:
         if len(many) == 1 and _is_alone(many[0]):
             bus, drive_bus = (stack.enter_context(end) for end in socket_pair(many[0].bus.channel))
-            compile_beside("canwall.cycle.sockets", "compile_run")  # here it is the drive's turn
+            compile_beside("canwall.cycle.sockets", "compile_run")  # the drive is compiled here
             runner = simdrive.SocketRunner(drives[0], drive_bus)
             yield Link(bus, runner.poll, runner.compiled)
             return
@@ -112,7 +112,7 @@ def on_the_bus(*many: Settings) -> Iterator[Link]:
 
 
 def _is_alone(settings: Settings) -> bool:
-    """True if nobody but master and drive takes part: another producer of the SYNC would."""
+    """Return True if only master and drive are on the bus, without another producer of SYNC."""
     bus = settings.bus
     return bus.exchange == "native" or (bus.exchange == "auto" and bus.sync == "produce")
 

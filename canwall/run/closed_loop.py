@@ -33,7 +33,7 @@ from canwall.walls import MAX_DELAY
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
-#: PDOs in which the cycle finds position, statusword and torque, and puts its torque.
+#: PDOs from which the cycle reads position, statusword and torque, and to which it writes.
 _TPDO = PdoLayout(
     0,
     (
@@ -164,7 +164,7 @@ class ClosedLoop:
 
 
 def loop_delay(settings: Settings) -> float:
-    """Return D of the simulated drive: cycles from a sample to its torque (theory, section 3)."""
+    """Return D of the simulated drive, the cycles from sample to torque (theory, section 3)."""
     assert settings.simulation is not None
     synchronous = settings.drive.torque_pdo != "immediate"
     return settings.simulation.torque_delay_cycles + (1.0 if synchronous else 0.0)
@@ -184,8 +184,8 @@ def cached_servo_scales(settings: Settings) -> ServoScales:
     """Return `servo_scales`, reading each dictionary only once."""
     drive, simulation = settings.drive, settings.simulation
     assert simulation is not None
-    # Reading a dictionary takes as long as a hundred strikes. The key is all that the scales
-    # depend on.
+    # Reading a dictionary takes as long as a hundred strikes. The key contains everything that the
+    # scales depend on.
     known = simulation.model_dump(
         mode="json", include={"objects", "counts_per_rev", "rated_torque_nm"}
     )

@@ -27,7 +27,7 @@ def referent_positions(
         wall_position: Position of the wall in each cycle [rad], shape (n,).
 
     Returns:
-        Positions [rad], shape (n,); None without `[simulation]`, for the hand is a person's.
+        Positions [rad], shape (n,); None without `[simulation]`, as a person's hand is not known.
     """
     if settings.simulation is None:
         return None

@@ -98,7 +98,7 @@ def _read_recorded(folder: RunFolder, troubles: list[str]) -> "pa.Table":
 
 
 def remarks_on(setup: DriveSetup, settings: Settings) -> list[str]:
-    """Return what the drive does not do as configured."""
+    """Return remarks on what the drive does not do as configured."""
     remarks = [f"the drive: {note}" for note in setup.notes]
     if setup.torque_limit_nm < settings.limits.torque_nm and setup.scales is not None:
         source = setup.scales.sources[-1][1]

@@ -1,4 +1,4 @@
-"""A CiA 402 servo drive that exists on the CAN bus alone: frames in, frames out."""
+"""Simulated CiA 402 servo drive: frames in, frames out."""
 
 from canwall.simdrive.build import TORQUE_LIMITS, ServoScales, make_drive, servo_scales
 from canwall.simdrive.communication.dictionary import Dictionary

@@ -68,7 +68,7 @@ class SimulatedDrive:
         real_time: bool = False,
         hardware: Hardware | None = None,
     ) -> None:
-        """Build the drive; it is dead until ``boot``.
+        """Build the drive, which is switched off until ``boot``.
 
         Args:
             dictionary: object dictionary, loaded for this node-ID; the drive takes it over.
@@ -94,7 +94,7 @@ class SimulatedDrive:
         if not torque_delay_cycles >= 0.0:
             raise ValueError(f"torque delay of {torque_delay_cycles} cycles is negative")
         self.state = DriveRecord()
-        """All that a cycle reads and writes."""
+        """State that a cycle reads and writes."""
         self._record, self._fields = self.state.record, self.state.fields
         self._fields.period = sync_period_s
         self._motion = motion
@@ -167,7 +167,7 @@ class SimulatedDrive:
 
     @property
     def passes_syncs(self) -> bool:
-        """True if time passes with each SYNC that arrives; False: with ``pass_sync`` alone."""
+        """True if time passes with each received SYNC, False if only with ``pass_sync``."""
         return self._passes_syncs
 
     @passes_syncs.setter
@@ -210,7 +210,7 @@ class SimulatedDrive:
         serve(self._dictionary)
 
     def switch_off(self) -> None:
-        """Switch the device off; it is dead until ``boot``."""
+        """Switch the device off until ``boot``."""
         self._pds.disable()
         self._nmt.state = NmtState.INITIALISATION
         self._route()
@@ -222,12 +222,12 @@ class SimulatedDrive:
         self._error_behaviour.communication_error()
 
     def bus_recovered(self) -> None:
-        """Report that the controller is back on the bus (EMCY 0x8140)."""
+        """Report the recovery from bus-off (EMCY 0x8140)."""
         self._emcy.occurred(RECOVERED_FROM_BUS_OFF, ERROR_BEHAVIOUR)
         self._emcy.gone(RECOVERED_FROM_BUS_OFF, ERROR_BEHAVIOUR)
 
     def boot(self) -> list[Frame]:
-        """Switch the device on: power-on values, boot-up message, PRE-OPERATIONAL."""
+        """Switch the device on: power-on values, boot-up message, PRE-OPERATIONAL state."""
         self._reset(communication_only=False)
         return self.take_outbox()
 
@@ -397,8 +397,8 @@ class SimulatedDrive:
     def _go_on_without_sync(self, dt: float) -> None:
         """Go on with a slow-down after the SYNC, and so the master, has gone.
 
-        A tick counts for a few milliseconds at most: if the program itself was held up, the SYNC
-        may be waiting.
+        A tick counts for a few milliseconds at most, because after a pause of the program itself
+        a SYNC may already be waiting.
         """
         fields = self._fields
         fields.without_sync += min(dt, _LONGEST_TICK_S)

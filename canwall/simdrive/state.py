@@ -1,14 +1,14 @@
-"""State of a drive from cycle to cycle: one record that Python and compiled code both work on.
+"""State of a drive from cycle to cycle: one record that Python and compiled code share.
 
-Services in Python read and write its fields as attributes (`DriveRecord.fields`), compiled
-functions take the record itself. What stands in it stands nowhere else.
+Services in Python read and write its fields as attributes (`DriveRecord.fields`); compiled
+functions take the record itself. Nothing in it is stored anywhere else.
 """
 
 import numpy as np
 
 from canwall.compiled import Record, compiled, fields
 
-#: Objects (sub-index 0) whose values stand in the record, and the place of each in `values`.
+#: Objects (sub-index 0) whose values are in the record, and the place of each in `values`.
 OBJECTS = (
     0x6041,
     0x6064,
@@ -47,7 +47,7 @@ CYCLIC_OBJECTS = tuple(
     OBJECTS[place] for place in (POSITION, VELOCITY, TORQUE_DEMAND, TORQUE, CURRENT, TARGET_TORQUE)
 )
 
-#: A deadline that does not come, in nanoseconds of protocol time.
+#: A deadline that never comes, in nanoseconds of protocol time.
 NEVER = (1 << 63) - 1
 
 #: PDOs of a device in each direction (CiA 301, 7.5.2.35 and 7.5.2.37), and mapped bytes of one.
@@ -71,8 +71,8 @@ PDO = np.dtype(
     align=True,
 )
 
-#: All that a cycle reads and writes. Times are in s unless their name says ns; torques in per mille
-#: of the rated torque as the bus counts them.
+#: State that a cycle reads and writes. Times are in s unless their name says ns; torques in per
+#: mille of the rated torque, as on the bus.
 DRIVE = np.dtype(
     [
         # True if SYNCs and RPDOs are for `steady.take`.

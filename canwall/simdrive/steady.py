@@ -1,9 +1,9 @@
-"""Steady operation: what a drive does from cycle to cycle while nothing but the torque changes.
+"""Steady operation of a drive, from cycle to cycle, while nothing but the torque changes.
 
-It is OPERATIONAL and in OPERATION ENABLED, follows the target torque of one synchronous RPDO, and
-nothing else is going on: no fault, ramp, delay or switch. All that SYNCs and RPDOs ask of it then
-is arithmetic on its record: one compiled call per frame, of the functions that its services call
-one by one at other times.
+The drive is OPERATIONAL and in OPERATION ENABLED and follows the target torque of one synchronous
+RPDO, without any fault, ramp, delay or switch. SYNCs and RPDOs then only require arithmetic on its
+record: one compiled call per frame, of the same functions that its services call one by one at
+other times.
 """
 
 import numpy as np
@@ -50,7 +50,7 @@ def take(drives: NDArray[np.void], can_id: int, length: int, data: int) -> int:
 
 @compiled
 def _brings_torque_only(drive: Record, rpdo: Record) -> bool:
-    """True if no other object than the target torque gets a new value."""
+    """Return True if only the target torque gets a new value."""
     for k in range(rpdo.field_count):
         field = rpdo.fields[k]
         news = drive.values[field.place] ^ (rpdo.data >> field.shift)

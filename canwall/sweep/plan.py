@@ -65,17 +65,17 @@ class Plan:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of the result: the number of values on each axis."""
+        """Shape of the result, i.e. the number of values on each axis."""
         return tuple(len(axis.values) for axis in self.axes)
 
     @property
     def point_count(self) -> int:
-        """Number of points of the result: strikes, each with its wall."""
+        """Number of points of the result, each a strike with its wall."""
         return math.prod(self.shape)
 
     @property
     def dtype(self) -> np.dtype[np.void]:
-        """Dtype of the result: MEASURES for a map, K_LIMIT for a search."""
+        """Dtype of the result, MEASURES for a map and K_LIMIT for a search."""
         return MEASURES if self.stiffness is not None else K_LIMIT
 
     @cached_property

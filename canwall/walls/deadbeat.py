@@ -70,7 +70,7 @@ def expect(wall: Record, force: float) -> float:
 
 @compiled
 def is_as_expected(wall: Record) -> bool:
-    """True if the handle is where the last force should have brought it."""
+    """Return True if the handle is where the last force should have brought it."""
     dy = abs(wall.y - wall.memory[EXPECTED_Y])
     dv = abs(wall.v - wall.memory[EXPECTED_V])
     size = abs(wall.y) + wall.period * abs(wall.v)

@@ -1,4 +1,4 @@
-"""CiA 301, 305 and 306: dictionary, SDO, PDO, SYNC, NMT, EMCY, watchdogs, LSS; a file a service.
+"""CiA 301, 305 and 306: dictionary, SDO, PDO, SYNC, NMT, EMCY, watchdogs and LSS.
 
-The meaning of the objects from 0x6000 on is the business of `profile`.
+Each service has a module of its own. Objects from 0x6000 on are handled by `profile`.
 """

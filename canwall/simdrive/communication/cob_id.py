@@ -20,7 +20,7 @@ _RESTRICTED = (
 
 
 def check_can_id(cob_id: int) -> None:
-    """Refuse 29-bit and restricted identifiers; those of a COB-ID that is not valid: 29-bit ones.
+    """Refuse 29-bit identifiers and, in a valid COB-ID, restricted ones.
 
     Raises:
         AccessError: INVALID_VALUE.

@@ -99,12 +99,12 @@ class Entry:
 
     @property
     def receivable(self) -> bool:
-        """True if an RPDO may carry it (CiA 306: rww is for process output only)."""
+        """True if an RPDO may carry it; rww is for process output only (CiA 306)."""
         return self.pdo_mapping and self.access in ("rw", "rww", "wo")
 
     @property
     def transmittable(self) -> bool:
-        """True if a TPDO may carry it (CiA 306: rwr is for process input only)."""
+        """True if a TPDO may carry it; rwr is for process input only (CiA 306)."""
         return self.pdo_mapping and self.access in ("ro", "rw", "rwr", "const")
 
     def allow(self, values: Container[int]) -> "Entry":

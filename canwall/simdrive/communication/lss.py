@@ -73,7 +73,7 @@ class LssSlave:
                 nodes change their bit timing.
         """
         self.node_id = node_id
-        """Pending node-ID: it holds from the next reset on."""
+        """Pending node-ID, which takes effect at the next reset."""
         self._active_node_id = node_id
         self._bit_timing = _BIT_RATES.get(bitrate)
         self._address = [dictionary.number(0x1018, n, absent=0) for n in range(1, 5)]

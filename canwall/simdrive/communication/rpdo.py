@@ -75,7 +75,7 @@ class Rpdo(Pdo):
 
     @property
     def steady(self) -> bool:
-        """True if `steady.take` may take it: the next SYNC does, and every value is accepted."""
+        """True if `steady.take` may take it, as it waits for SYNC and accepts every value."""
         unlimited = all(entry.low is None and entry.high is None for entry in self._entries)
         return self.synchronous and self.in_state and unlimited
 
@@ -88,7 +88,7 @@ class Rpdo(Pdo):
         self.stop()
 
     def stop(self) -> None:
-        """Drop what was received: it is not for a later time in OPERATIONAL."""
+        """Drop received data, so that it does not take effect on a return to OPERATIONAL."""
         self._pdo.pending = False
         self._pdo.deadline_ns = NEVER
 

@@ -17,7 +17,7 @@ _FRAME_SIZE = 8
 _SEGMENT_SIZE = 7
 _EXPEDITED_SIZE = 4
 _MAX_SIZE = 1 << 16
-"""Bytes that a string or domain may be given; the device's memory, so to say."""
+"""Largest size of a string or domain [bytes], given by the memory of the device."""
 _TIME_OUT_NS = 1000 * NS_PER_MS
 """Time that a transfer waits for the client's next frame."""
 
@@ -79,7 +79,13 @@ class SdoServer:
     """Answers the default SDO; one transfer at a time, a new one replaces the old."""
 
     def __init__(self, dictionary: Dictionary, clock: Clock, send: Send) -> None:
-        """Args: dictionary: what is read and written; clock: protocol time; send: the bus."""
+        """Serve the default SDO.
+
+        Args:
+            dictionary: the objects to read and write.
+            clock: protocol time.
+            send: takes the responses.
+        """
         self.can_id = SDO_REQUEST + dictionary.node_id
         """CAN-ID of the requests."""
         self._response_id = SDO_RESPONSE + dictionary.node_id
@@ -134,7 +140,7 @@ class SdoServer:
         self._send((self._response_id, _ABORT.pack(_ABORT_RESPONSE, *key, code)))
 
     def _key(self, command: int, data: bytes, in_block: bool) -> Key:
-        """Return index and sub-index for an abort: only what initiates carries them."""
+        """Return index and sub-index for an abort; only initiating requests carry their own."""
         initiates = command in (_DOWNLOAD, _UPLOAD) or (
             command in (_BLOCK_DOWNLOAD, _BLOCK_UPLOAD) and _subcommand(data) == _BLOCK_INITIATE
         )
@@ -242,7 +248,7 @@ class SdoServer:
         entry = self._dictionary.find(index, subindex)
         value = entry.upload()
         upload = BlockUpload(entry, value, block_size)
-        if 0 < len(value) <= threshold:  # the client would rather have it in segments
+        if 0 < len(value) <= threshold:  # the client prefers a segmented transfer
             return self._initiate_upload(data)
         self._transfer = upload
         head = _BLOCK_UPLOAD_RESPONSE | _CRC | _BLOCK_SIZE_INDICATED

@@ -1,4 +1,4 @@
-"""SDO block transfer (CiA 301, 7.2.4.2.10 to 7.2.4.2.14): what one transfer remembers."""
+"""SDO block transfer (CiA 301, 7.2.4.2.10 to 7.2.4.2.14): state of one transfer."""
 
 from binascii import crc_hqx
 from struct import Struct
@@ -45,7 +45,7 @@ class BlockDownload:
     def segment(self, data: bytes) -> list[bytes]:
         """Take a segment; return the response that the last one of a block gets.
 
-        A segment that is missing makes those after it worthless: the client sends them again.
+        Segments after a missing one are discarded; the client sends them again.
 
         Raises:
             AccessError: INVALID_SEQUENCE_NUMBER, OUT_OF_MEMORY.

@@ -16,10 +16,10 @@ _HIGHEST_COUNTER = 240
 
 
 class Tpdo(Pdo):
-    """One transmit PDO: with every n-th SYNC (1 to 240), or when its content has changed.
+    """One transmit PDO, sent with every n-th SYNC (1 to 240) or when its content has changed.
 
-    Or only when a remote frame asks for it, with the content of the last SYNC (252) or the present
-    one (253). Others answer remote frames as well, while bit 30 of their COB-ID is clear.
+    Types 252 and 253 are sent only on request by a remote frame, with the content of the last SYNC
+    or the present one. Other types also answer remote frames while bit 30 of the COB-ID is clear.
     With a SYNC counter, the first of every n-th waits for the SYNC start value (0x1800:06).
     An event is a change of the mapped values. It is sent with the next SYNC (type 0), or directly
     (254, 255), no sooner than the inhibit time after the last; the event timer sends without one.
@@ -57,7 +57,7 @@ class Tpdo(Pdo):
 
     @property
     def answers_remote(self) -> bool:
-        """True if remote frames are answered: bit 30 of the COB-ID is clear."""
+        """True if remote frames are answered, i.e. bit 30 of the COB-ID is clear."""
         return not self._cob_id.value & BIT_30
 
     @property
@@ -78,7 +78,7 @@ class Tpdo(Pdo):
 
     @property
     def quiet(self) -> bool:
-        """True if it is sent on events, and none will come of SYNCs and torques alone."""
+        """True if it is sent on events, and SYNCs and torques alone cause none."""
         constant = all(entry.index not in CYCLIC_OBJECTS for entry in self._entries)
         return constant and not self._event_ns and self._sent == self._payload()
 

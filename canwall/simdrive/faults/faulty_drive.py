@@ -127,7 +127,7 @@ class FaultyDrive:
         self._settle()
 
     def _settle(self) -> None:
-        """Note whether there is anything to do but to pass frames on."""
+        """Determine whether frames only have to be passed on."""
         self._idle = self._wire.transparent and not self._waiting
         self.drive.passes_syncs = self._idle
         self._show()

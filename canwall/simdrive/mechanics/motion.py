@@ -40,7 +40,7 @@ MOTION = np.dtype(
 
 @compiled
 def has_script(motions: NDArray[np.void]) -> bool:
-    """True if the piece of the script has the present period."""
+    """Return True if the piece of the script contains the present period."""
     motion: Record = motions[0]
     return motion.elapsed - motion.first < _PIECE
 
@@ -58,7 +58,7 @@ def advance_motion(motions: NDArray[np.void], torque: float, duration: float) ->
         if not has_script(motions):
             return duration
         rest = motion.period - motion.share
-        # What is over to the last bits is over: no sliver of a period is left to follow.
+        # A period that is over but for rounding is over, so that no tiny rest of it remains.
         over = duration >= rest * _REACHED
         moved = min(duration, rest) if over else duration
         k = motion.elapsed - motion.first
@@ -86,7 +86,7 @@ class RecordedMotion(Protocol):
 
     @property
     def record(self) -> NDArray[np.void] | None:
-        """All there is to know of it, shape (1,), dtype MOTION; None: it is not all there is."""
+        """Complete state, shape (1,), dtype MOTION; None if a record cannot hold it."""
         ...
 
 
@@ -114,14 +114,14 @@ class ServoMotion:
         self._lay_out()
 
     def _lay_out(self) -> None:
-        """Lay out the next piece; what is over is dropped, however long the drive lives."""
+        """Lay out the next piece and drop the previous one, so that memory stays bounded."""
         first = self._fields.first = self._fields.elapsed
         script = hand_force(self._hand, self._period_s, _PIECE, first)
         self._motion["push"][0], self._motion["slope"][0] = script
 
     @property
     def record(self) -> NDArray[np.void]:
-        """All there is to know of it: shape (1,), dtype MOTION."""
+        """Complete state as a record, shape (1,), dtype MOTION."""
         return self._motion
 
     @property

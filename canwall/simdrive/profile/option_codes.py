@@ -70,10 +70,10 @@ class OptionCode:
 
     @property
     def disables(self) -> bool:
-        """Of the quick stop: True if the drive function is disabled immediately (0)."""
+        """True if a quick stop disables the drive function immediately (0)."""
         return bool(self._entry.value == 0)
 
     @property
     def stays(self) -> bool:
-        """Of the quick stop: True if the drive stays in QUICK STOP ACTIVE (5 to 7)."""
+        """True if the drive stays in QUICK STOP ACTIVE after a quick stop (5 to 7)."""
         return self._entry.value in _STAYING

@@ -1,8 +1,8 @@
-"""I²t: how long the motor may have more than its rated torque.
+"""I²t monitoring: limit of the time for which the motor may exceed its rated torque.
 
-A budget of the square of the torque (as of the current) above the rated one, over time. Once it is
-used up the torque falls back to the rated one; less than that fills it again. Torques are in per
-mille of the rated one.
+The budget is the integral of the squared torque (or current) above the rated one. Once it is used
+up, the torque falls back to the rated one; a lower torque restores the budget. Torques are in per
+mille of the rated torque.
 """
 
 import math
@@ -35,7 +35,7 @@ def covered(drives: NDArray[np.void], used: float) -> int:
 
 @compiled
 def warns(drives: NDArray[np.void], used: float) -> bool:
-    """True if so much of the budget is used that the drive warns of it."""
+    """Return True if so much of the budget is used that the drive warns."""
     drive: Record = drives[0]
     return used > _WARNING * drive.budget
 

@@ -19,8 +19,8 @@ STANDSTILL_RAD_S = 2.0 * math.pi / 60.0
 """Standstill: less than one revolution per minute."""
 
 _GIVES_UP_S = 5.0
-# A load beyond the limits of the drive must not keep it in its slow-down for ever: Beckhoff's
-# AX2000, for one, disables after 5 s (STOPMODE).
+# A load beyond the limits of the drive must not keep it in its slow-down forever. Beckhoff's
+# AX2000, for example, disables after 5 s (STOPMODE).
 
 _GAIN = 0.5
 """Part of a velocity error that is corrected within one period."""

@@ -70,7 +70,7 @@ def decode(controlword: int) -> Command | None:
     if not controlword & 0x04:
         return Command.QUICK_STOP
     if controlword & FAULT_RESET:
-        return None  # the standard wants bit 7 clear; only commands that stop are obeyed regardless
+        return None  # the standard requires bit 7 clear; only stopping commands ignore it
     if not controlword & 0x01:
         return Command.SHUTDOWN
     return Command.ENABLE_OPERATION if controlword & 0x08 else Command.SWITCH_ON
@@ -119,7 +119,7 @@ class StateMachine:
 
     @property
     def powered(self) -> bool:
-        """True if the drive function is on: a lost connection has an effect (0x6007)."""
+        """True if the drive function is on, so that a lost connection has an effect (0x6007)."""
         return self.state in (PdsState.OPERATION_ENABLED, PdsState.QUICK_STOP_ACTIVE)
 
     @property
