@@ -114,7 +114,9 @@ def on_the_bus(*many: Settings) -> Iterator[Link]:
 def _is_alone(settings: Settings) -> bool:
     """Return True if only master and drive are on the bus, without another producer of SYNC."""
     bus = settings.bus
-    return bus.exchange == "native" or (bus.exchange == "auto" and bus.sync == "produce")
+    if bus.exchange == "auto":
+        return bus.sync == "produce"
+    return bus.exchange != "python-can"
 
 
 def _call_all(functions: Sequence[Callable[[], None]]) -> None:
