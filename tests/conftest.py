@@ -1,6 +1,6 @@
 """Fixtures for all tests: rigs and programs that end with the test, and one recorded run.
 
-And the rule for the mark `slow`, see `slow` in pyproject.toml.
+Reports unmarked tests that are `slow` by the rule in pyproject.toml.
 """
 
 import contextlib

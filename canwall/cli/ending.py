@@ -41,6 +41,6 @@ def guarded(command: Callable[[], object]) -> int:
 
 
 def _is_bus_error(error: Exception) -> bool:
-    """True if python-can raised it, which takes long to import: not at all if nobody has."""
+    """Return True for an error of python-can, without importing it: that takes long."""
     can = sys.modules.get("can")
     return can is not None and isinstance(error, can.CanError)
