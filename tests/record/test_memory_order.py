@@ -10,7 +10,6 @@ import llvmlite.binding as llvm
 import numpy as np
 import pytest
 from numba import njit, typeof
-from numpy.typing import NDArray
 
 from canwall.record import ROW, Ring, ring
 from canwall.record.append import load_acquire, put_frame, put_row, store_release
