@@ -17,7 +17,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from canwall.compiled import copied
-from canwall.config import ConfigError, Wall, WallChange, absolute_law, first_error
+from canwall.config import ConfigError, Wall, WallChange, absolute_law, check_values, first_error
 from canwall.cycle import Offer, WallAxis, set_limits, set_wall
 from canwall.errors import RunFailedError
 from canwall.record import Mailbox, RunFolder
@@ -164,6 +164,7 @@ def _parse_change(assignments: Sequence[str]) -> WallChange:
             if not isinstance(table, dict):
                 raise ConfigError(f"{key.strip()}: {part} has a value of its own; keep one of them")
         table[name] = _parse_value(value)
+    check_values(values)
     if isinstance(values.get("law"), str):
         values["law"] = absolute_law(values["law"], Path())
     try:
@@ -175,5 +176,5 @@ def _parse_change(assignments: Sequence[str]) -> WallChange:
 def _parse_value(text: str) -> Any:
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         return text.strip()  # a string without quotes

@@ -11,6 +11,7 @@ import importlib.util
 import inspect
 import keyword
 import math
+import os
 import re
 import traceback
 from collections.abc import Callable, Mapping
@@ -30,7 +31,7 @@ from canwall.walls.interface import MAX_OPTIONS, Law, UnknownLawError, wall_with
 def load_law(path: Path, function: str) -> Law:
     """Return the law of a function in a file, compiled. Raises UnknownLawError."""
     where = f"{path}:{function}"
-    if not path.is_file():
+    if not os.path.isfile(path):  # Path.is_file raises for names that are too long
         raise UnknownLawError(f"{where}: no such file")
     spec = importlib.util.spec_from_file_location(path.stem, path)
     if spec is None or spec.loader is None:

@@ -186,7 +186,7 @@ def test_helpers_constants_memory_and_plain_integers(write: Write) -> None:
         ),
         (
             "def mine(wall):\n    wall.hardness = 1.0\n    return 0.0\n",
-            "line 2: does not compile: ",
+            "line 2: uses hardness, which is neither a field of the wall nor an option",
         ),
         (
             "OPTIONS = {'growth': 1}\ndef mine(wall):\n    return wall.options.grwth\n",
