@@ -1,19 +1,18 @@
 """Compilation with numba: one decorator, and one type for records in compiled code."""
 
-import contextlib
 import functools
-import hashlib
 import math
 import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, ParamSpec, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from canwall.code_on_disk import cache_class, is_first_start, is_ours
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -21,42 +20,6 @@ _R = TypeVar("_R")
 #: One element of a structured array, e.g. `walls[0]`. In compiled code its fields are writable
 #: attributes, which Python's type system cannot express; hence Any.
 Record: TypeAlias = Any
-
-
-#: Packages that compiled code elsewhere neither calls nor takes dtypes or constants from.
-_WITHOUT_COMPILED_CODE = ("bench", "cli", "config", "study", "sweep", "workbench")
-
-
-def _drop_stale_code() -> bool:
-    """Remove cached machine code that is older than a change of a source it may depend on.
-
-    numba notices changes of the file that defines a function, but not of the files it calls into:
-    a law would go on using the estimator with which it was compiled.
-
-    Returns:
-        True at a first start, when nothing compiled from the present sources is in the cache.
-    """
-    package = Path(__file__).resolve().parent
-    sources = sorted(
-        path
-        for path in package.rglob("*.py")
-        if path.relative_to(package).parts[0] not in _WITHOUT_COMPILED_CODE
-    )
-    states = [(str(s.relative_to(package)), s.stat().st_mtime_ns) for s in sources]
-    digest = hashlib.sha256(repr(states).encode()).hexdigest()
-    note = package / "__pycache__" / "sources.sha256"
-    with contextlib.suppress(OSError):  # a read-only installation has no cache
-        if note.exists() and note.read_text() == digest:
-            return False
-        for kept in (*package.rglob("*.nbi"), *package.rglob("*.nbc")):
-            kept.unlink(missing_ok=True)
-        note.parent.mkdir(exist_ok=True)
-        note.write_text(digest)
-        return True
-    return False
-
-
-_first_start = _drop_stale_code()
 
 
 class _Compiling:
@@ -97,41 +60,11 @@ def compile_beside(module: str, function: str) -> None:
     Nothing waits for that process: code that it has cached in time is loaded, and the rest is
     compiled here as well.
     """
-    if _first_start and not _beside and (os.cpu_count() or 1) > 1:
+    if is_first_start() and not _beside and (os.cpu_count() or 1) > 1:
         nowhere = subprocess.DEVNULL
         program = f"from {module} import {function}; {function}()"
         arguments = [sys.executable, "-P", "-c", program]
         _beside.append(subprocess.Popen(arguments, stdin=nowhere, stdout=nowhere, stderr=nowhere))
-
-
-@functools.cache
-def _code_on_disk() -> Any:
-    """Return a variant of numba's cache that loads machine code without preparing to compile.
-
-    numba fills its registries (and imports scipy.linalg for them) before it looks into the cache.
-    Loading needs only the symbols of its runtime, and numba fills the registries by itself before
-    it compiles. This halves the start of a program whose code is all in the cache.
-    """
-    from numba.core.caching import FunctionCache
-    from numba.core.runtime import rtsys
-
-    class CodeOnDisk(FunctionCache):  # type: ignore[misc]
-        def __init__(self, function: Callable[..., Any], use: str) -> None:
-            super().__init__(function)
-            self._use = use
-
-        def load_overload(self, sig: Any, target_context: Any) -> Any:
-            rtsys.initialize(target_context)
-            with self._guard_against_spurious_io_errors():
-                code = self._load_overload(sig, target_context)
-            if code is None:
-                _compiling.note_miss()
-            return code
-
-        def _index_key(self, sig: Any, codegen: Any) -> Any:
-            return (*super()._index_key(sig, codegen), self._use)
-
-    return CodeOnDisk
 
 
 class _Compiled:
@@ -185,12 +118,17 @@ class _Compiled:
         from numba import njit
 
         dispatcher = njit(nogil=True, error_model="numpy", **options)(self._function)
-        dispatcher._cache = _code_on_disk()(self._function, caller)
+        if is_ours(self._function):
+            dispatcher._cache = cache_class()(self._function, caller, _compiling.note_miss)
         return dispatcher
 
 
 def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Compile with numba: cached on disk, without the interpreter lock, with IEEE 754 division."""
+    """Compile with numba: without the interpreter lock, with IEEE 754 division.
+
+    The code of this package's functions is cached on disk. Nothing tracks changes of what other
+    functions call.
+    """
     result: Any = _Compiled(function)
     return result
 
@@ -201,8 +139,7 @@ def compiled_for_c(function: Callable[..., Any], signature: Any, kept: bool = Tr
     Args:
         function: The function.
         signature: Its signature, as numba's.
-        kept: Cache the code on disk. For functions of this package only: nothing tracks changes of
-            what other functions call.
+        kept: Cache the code on disk, for functions that call nothing but this package.
 
     Returns:
         numba's CFunc, with `address`; the code lives as long as this object.
@@ -214,8 +151,8 @@ def compiled_for_c(function: Callable[..., Any], signature: Any, kept: bool = Tr
     from numba.core.sigutils import normalize_signature
 
     result: Any = CFunc(function, normalize_signature(signature), {}, {"error_model": "numpy"})
-    if kept:
-        result._cache = _code_on_disk()(function, "C")
+    if kept and is_ours(function):
+        result._cache = cache_class()(function, "C", _compiling.note_miss)
     result.compile()
     return result
 

@@ -1,8 +1,26 @@
-"""The two kinds of failure that a user sees; the text of each is one line."""
+"""The two kinds of failure that a user sees; the text of each is one short line."""
+
+import re
+
+#: Longest word and longest text of a message, which may quote what it is about [characters].
+_WORD, _TEXT = 250, 1000
+
+
+def one_line(text: str) -> str:
+    """Return a text as a line: control characters escaped, what is too long cut in its middle."""
+    printable = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    return _cut(re.sub(r"\S+", lambda word: _cut(word[0], _WORD), printable), _TEXT)
+
+
+def _cut(text: str, most: int) -> str:
+    return text if len(text) <= most else f"{text[: most // 2]}…{text[-(most // 2 - 1) :]}"
 
 
 class InputError(ValueError):
     """Input that cannot be used; the text says what, where, and what to do. Exit code 2."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(one_line(text))
 
 
 class ConfigError(InputError):
@@ -11,3 +29,6 @@ class ConfigError(InputError):
 
 class RunFailedError(Exception):
     """Failure of a run. Exit code 1."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(one_line(text))

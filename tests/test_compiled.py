@@ -1,47 +1,163 @@
-"""Code that was compiled before a change of the sources is not used afterwards."""
+"""Code that is called is the code that is there, wherever it is kept, whoever starts beside."""
 
+import os
 import shutil
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 import canwall
+from canwall import code_on_disk
 from canwall.compiled import data_to_number, number_to_data
 
 FALL = """
+from canwall.compiled import _compiling
+missed = []
+_compiling.note_miss = lambda: missed.append(1)
 from canwall.physics import advance, make_plant
-print(advance(make_plant(2.0)[0], 1.0, 0.0, -4.0, 0.0, 1.0))
+print(advance(make_plant(2.0)[0], 1.0, 0.0, -4.0, 0.0, 1.0), end=" ")
+print("compiled" if missed else "loaded")
 """
+LINE = "    a0 = (u0 - spring * y) / mass\n"
+PATIENCE_S = 300.0
 
 
-def fall(package: Path) -> str:
-    done = subprocess.run(
-        [sys.executable, "-c", FALL],
-        cwd=package.parent,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return done.stdout.strip()
+class Installation:
+    """A copy of the package, and the environment in which its programs start."""
+
+    def __init__(self, folder: Path) -> None:
+        self.package = folder / "canwall"
+        source = Path(canwall.__file__).parent
+        shutil.copytree(source, self.package, ignore=shutil.ignore_patterns("__pycache__"))
+        self.user = folder / "user"
+        self.environment = {
+            **{name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"},
+            "XDG_CACHE_HOME": str(self.user),
+            "PYTHONDONTWRITEBYTECODE": "1",
+        }
+
+    def start(self, program: str = FALL) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [sys.executable, "-c", program],
+            cwd=self.package.parent,
+            env={**self.environment, "PYTHONPATH": str(self.package.parent)},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def run(self, program: str = FALL) -> str:
+        started = self.start(program)
+        output, _ = started.communicate(timeout=PATIENCE_S)
+        assert started.returncode == 0
+        return output.strip()
+
+    def change(self, line: str, other: str) -> None:
+        """Exchange a line of a function that `advance` calls, in another file."""
+        oscillator = self.package / "physics" / "oscillator.py"
+        text = oscillator.read_text()
+        assert text.count(line) == 1
+        oscillator.write_text(text.replace(line, other))
+
+    def refuse_files(self) -> None:
+        """Make it impossible to keep anything beside the sources, for root as well."""
+        for folder in (self.package, *self.package.rglob("*/")):
+            if folder.is_dir():
+                (folder / "__pycache__").touch()
+
+
+@pytest.fixture
+def installation(tmp_path: Path) -> Installation:
+    return Installation(tmp_path)
+
+
+def beside(installation: Installation) -> Path:
+    return installation.package / "__pycache__"
+
+
+def in_a_given_folder(installation: Installation) -> Path:
+    given = installation.package.parent / "given"
+    installation.environment["NUMBA_CACHE_DIR"] = str(given)
+    return given
+
+
+def in_the_users_cache(installation: Installation) -> Path:
+    installation.refuse_files()
+    return installation.user
+
+
+def nowhere(installation: Installation) -> Path | None:
+    installation.refuse_files()
+    installation.user.touch()
+    return None
 
 
 @pytest.mark.slow
-def test_change_in_another_file_is_noticed(tmp_path: Path) -> None:
-    source = Path(canwall.__file__).parent
-    package = tmp_path / "canwall"
-    shutil.copytree(source, package, ignore=shutil.ignore_patterns("__pycache__"))
-    assert fall(package) == "(0.0, -2.0, False)"
-    oscillator = package / "physics" / "oscillator.py"
-    text = oscillator.read_text()
-    assert text.count("    a0 = (u0 - spring * y) / mass\n") == 1
-    oscillator.write_text(
-        text.replace(
-            "    a0 = (u0 - spring * y) / mass\n", "    a0 = 0.5 * (u0 - spring * y) / mass\n"
-        )
-    )
-    assert fall(package) == "(0.5, -1.0, False)"
+@pytest.mark.parametrize("place", [beside, in_a_given_folder, in_the_users_cache, nowhere])
+def test_change_in_another_file_is_noticed(
+    installation: Installation, place: Callable[[Installation], Path | None]
+) -> None:
+    folder = place(installation)
+    kept = "compiled" if folder is None else "loaded"
+    assert installation.run() == "(0.0, -2.0, False) compiled"
+    assert installation.run() == f"(0.0, -2.0, False) {kept}"
+    half = LINE.replace("= (", "= 0.5 * (")
+    installation.change(LINE, half)
+    assert installation.run() == "(0.5, -1.0, False) compiled"
+    # The code of other sources has been left to those who run them.
+    installation.change(half, LINE)
+    assert installation.run() == f"(0.0, -2.0, False) {kept}"
+    if folder is not None:
+        assert len(list(folder.rglob("compiled-*"))) == 2
+
+
+@pytest.mark.slow
+def test_several_first_starts_at_once(installation: Installation) -> None:
+    for process in [installation.start() for _ in range(4)]:
+        output, _ = process.communicate(timeout=PATIENCE_S)
+        assert output.startswith("(0.0, -2.0, False)")
+    assert installation.run() == "(0.0, -2.0, False) loaded"
+    for file in beside(installation).rglob("*-*"):
+        if file.is_file():
+            file.write_bytes(file.read_bytes()[:-1])
+    assert installation.run() == "(0.0, -2.0, False) compiled"
+
+
+@pytest.mark.slow
+def test_process_whose_sources_change_keeps_nothing(installation: Installation) -> None:
+    """It may have imported a source before or after the change."""
+    changing = "import canwall.physics, pathlib; pathlib.Path('canwall/units.py').touch()\n"
+    assert installation.run(changing + FALL) == "(0.0, -2.0, False) compiled"
+    assert not list(installation.package.parent.rglob("compiled-*"))
+
+
+def test_folders_of_other_sources_are_removed_when_unused(tmp_path: Path) -> None:
+    now_s, day_s = time.time(), 86400.0
+    for days in range(20):
+        (tmp_path / f"compiled-{days}").mkdir()
+        os.utime(tmp_path / f"compiled-{days}", (now_s, now_s - (0.6 + 0.1 * days) * day_s))
+    present = tmp_path / "compiled-19"
+    code_on_disk._tidy_up(present)
+    assert abs(present.stat().st_mtime - now_s) < 0.5 * day_s
+    left = {int(folder.name.partition("-")[2]) for folder in tmp_path.iterdir()}
+    assert left == {*range(8), 19}
+    # However many have been used within the last day.
+    for days in range(20):
+        (tmp_path / f"compiled-{days}").mkdir(exist_ok=True)
+        os.utime(tmp_path / f"compiled-{days}")
+    code_on_disk._tidy_up(tmp_path / "compiled-18")
+    assert len(list(tmp_path.iterdir())) == 20
+
+
+def test_rooms_without_compiled_code_have_none() -> None:
+    package = Path(canwall.__file__).parent
+    for room in code_on_disk._WITHOUT_COMPILED_CODE:
+        for source in (package / room).rglob("*.py"):
+            assert "@compiled" not in source.read_text()
+            assert "compiled_for_c" not in source.read_text()
 
 
 def test_data_survive_the_way_through_a_number() -> None:

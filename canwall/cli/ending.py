@@ -6,7 +6,7 @@ from collections.abc import Callable
 import typer
 
 from canwall.cli.output import say
-from canwall.errors import InputError, RunFailedError
+from canwall.errors import InputError, RunFailedError, one_line
 
 #: Exit codes: a run that failed or tripped, bad input, Ctrl-C with the drive disabled.
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
@@ -27,7 +27,7 @@ def guarded(command: Callable[[], object]) -> int:
         return INTERRUPTED
     except typer.TyperException as error:
         if text := error.format_message():  # empty if the help was shown instead
-            say(text)
+            say(one_line(text))
         return BAD_INPUT
     except InputError as error:
         say(str(error))

@@ -7,7 +7,14 @@ Every key has its unit in its name. An unknown key, a wrong type or an impossibl
 from canwall.config.drive import Drive
 from canwall.config.fault import Fault
 from canwall.config.hand import Hand, Move, RandomStrikes
-from canwall.config.reading import absolute_law, first_error, load, shipped, with_overrides
+from canwall.config.reading import (
+    absolute_law,
+    check_values,
+    first_error,
+    load,
+    shipped,
+    with_overrides,
+)
 from canwall.config.settings import (
     Bus,
     Estimator,
@@ -42,6 +49,7 @@ __all__ = [
     "Wall",
     "WallChange",
     "absolute_law",
+    "check_values",
     "first_error",
     "load",
     "shipped",

@@ -20,6 +20,10 @@ _METRIC_KEYS = {
     "damping_n_s_per_m": ("damping_nm_s_per_rad", 2),
 }
 
+#: Tables and arrays in each other; the deepest key has five.
+_DEEPEST = 20
+_TOO_DEEP = f"tables or arrays in each other, more than {_DEEPEST} deep; write them flat"
+
 
 def _convert_metric_keys(raw: dict[str, Any]) -> None:
     """Convert metric keys to angular ones; leave values of a wrong type to the validation."""
@@ -59,13 +63,16 @@ def load(path: Path, overrides: Mapping[str, Any] | None = None) -> Settings:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; give the path of a configuration") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError) as error:  # ValueError: for a NUL, and for what is no UTF-8
         raise ConfigError(f"{path}: cannot be read: {error}") from None
     try:
         raw = tomllib.loads(text)
     except ValueError as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from None
+    except RecursionError:
+        raise ConfigError(f"{path}: {_TOO_DEEP}") from None
     try:
+        check_values(raw)
         _convert_metric_keys(raw)
         for dotted, value in (overrides or {}).items():
             section, key = dotted.split(".")
@@ -78,6 +85,27 @@ def load(path: Path, overrides: Mapping[str, Any] | None = None) -> Settings:
     except ValidationError as error:
         raise ConfigError(f"{path}: {first_error(error)}") from None
     return _with_absolute_paths(settings, path.parent)
+
+
+def check_values(raw: Mapping[str, Any]) -> None:
+    """Raise ConfigError for what no key takes and what few functions expect.
+
+    These are NUL characters, integers of more than 64 bits, and tables deep in each other.
+    """
+    waiting: list[tuple[tuple[str, ...], Any]] = [((), raw)]
+    while waiting:
+        keys, value = waiting.pop()
+        where = ".".join(keys)
+        if len(keys) > _DEEPEST:
+            raise ConfigError(f"{where}: {_TOO_DEEP}")
+        if any("\0" in text for text in (where, value) if isinstance(text, str)):
+            raise ConfigError(f"{where}: has a NUL character; take it out")
+        if isinstance(value, int) and not -(2**63) <= value < 2**63:
+            raise ConfigError(f"{where}: an integer of more than 64 bits; give a smaller one")
+        if isinstance(value, dict):
+            waiting += [((*keys, key), inner) for key, inner in value.items()]
+        elif isinstance(value, list):
+            waiting += [((*keys, str(i)), inner) for i, inner in enumerate(value)]
 
 
 def with_overrides(settings: Settings, values: Mapping[str, Any]) -> Settings:

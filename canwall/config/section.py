@@ -1,6 +1,7 @@
 """Base class of all sections of a configuration, and types that TOML represents differently."""
 
 import math
+import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
@@ -13,6 +14,9 @@ from pydantic import (
     Field,
     create_model,
 )
+
+#: Longest name of a file or a folder on Linux [bytes].
+_LONGEST_NAME = 255
 
 
 class Section(BaseModel):
@@ -68,6 +72,12 @@ def _path(value: object) -> object:
     return Path(value) if isinstance(value, str) else value
 
 
+def _possible(value: Path) -> Path:
+    if any(len(os.fsencode(name)) > _LONGEST_NAME for name in value.parts):
+        raise ValueError(f"no file has a name of more than {_LONGEST_NAME} bytes")
+    return value
+
+
 def _ordered(value: tuple[float, float]) -> tuple[float, float]:
     if not value[0] < value[1]:
         raise ValueError("the lower value has to come first and lie below the upper one")
@@ -79,7 +89,7 @@ _T = TypeVar("_T")
 #: An array, which TOML reads as a list, as an immutable tuple.
 Array = Annotated[_T, BeforeValidator(_tuple)]
 Names = Array[tuple[str, ...]]
-FilePath = Annotated[Path, BeforeValidator(_path)]
+FilePath = Annotated[Path, BeforeValidator(_path), AfterValidator(_possible)]
 Number = Annotated[float, BeforeValidator(_float)]
 Positive = Annotated[Number, Field(gt=0)]
 NonNegative = Annotated[Number, Field(ge=0)]

@@ -1,6 +1,6 @@
 """SYNC-driven loop: exchange of frames, one compiled step, timing, limits and trips."""
 
-from canwall.cycle.axis import WallAxis, WallStage
+from canwall.cycle.axis import Offer, WallAxis, WallStage
 from canwall.cycle.bus_monitor import BusMonitor
 from canwall.cycle.exchange import Exchange, SyncLostError
 from canwall.cycle.laws import named_law, run_laws, with_law
@@ -9,7 +9,7 @@ from canwall.cycle.machine import real_time_machine
 from canwall.cycle.python_can import PythonCanTransport
 from canwall.cycle.realtime import Grant, real_time_priority
 from canwall.cycle.sockets import SocketTransport
-from canwall.cycle.state import CYCLE, MAX_LAWS, fade_in, make_cycle, set_wall, start_at
+from canwall.cycle.state import CYCLE, MAX_LAWS, fade_in, make_cycle, set_limits, set_wall, start_at
 from canwall.cycle.step import step
 from canwall.cycle.timing import HISTOGRAM, buckets_ns, observe_ns, percentile_ns, timing_summary
 from canwall.cycle.transport import CycleFrames, Transport
@@ -24,6 +24,7 @@ __all__ = [
     "Exchange",
     "Grant",
     "Loop",
+    "Offer",
     "Outcome",
     "PythonCanTransport",
     "SocketTransport",
@@ -43,6 +44,7 @@ __all__ = [
     "real_time_priority",
     "run_laws",
     "run_loop",
+    "set_limits",
     "set_wall",
     "start_at",
     "step",

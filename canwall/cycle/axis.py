@@ -12,7 +12,7 @@ from canwall.cycle.state import SYNCHRONOUS_DELAY, make_cycle
 from canwall.cycle.timing import HISTOGRAM
 from canwall.cycle.trips import Trip
 from canwall.drive import DriveNode, DriveSetup
-from canwall.record import ROW, Mailbox, Phase, Ring
+from canwall.record import ROW, Phase, Ring
 from canwall.walls import Law
 
 
@@ -26,6 +26,27 @@ class WallStage:
 
 
 @dataclass
+class Offer:
+    """A change of the wall that has been judged, ready for the loop to put into force.
+
+    Attributes:
+        revision: Revision of the wall in force against which it was judged.
+        wall: Wall after the change.
+        limits: Limits after it.
+        turns: Walls that alternate after it.
+        since: Cycle from which on it is in force.
+        outdated: True if another change came first.
+    """
+
+    revision: int
+    wall: Wall
+    limits: Limits
+    turns: list[Wall]
+    since: int | None = None
+    outdated: bool = False
+
+
+@dataclass
 class WallAxis:
     """A drive that is set up, its wall, and the ring for its rows."""
 
@@ -35,8 +56,10 @@ class WallAxis:
     laws: Sequence[Law]
     ring: Ring
     changes: list[WallStage] = field(default_factory=list)
-    #: Changes of the wall requested by other processes.
-    mailbox: Mailbox | None = None
+    #: A change that another process has requested; whoever takes it out decides on it.
+    offers: list[Offer] = field(default_factory=list)
+    #: Number of changes of the wall in force so far.
+    revision: int = 0
     #: Reason from outside the cycle to give up the wall; empty if there is none.
     reported: str = ""
     #: Number of the next of the alternating walls.
@@ -88,6 +111,13 @@ class WallAxis:
         if self.active and not self.cycle["trip"][0]:
             self.reported = text
             self.cycle["trip"] = np.int64(Trip.REPORTED)
+
+    def take_offer(self) -> Offer | None:
+        """Take the requested change out, if there is one and nobody else has taken it."""
+        try:
+            return self.offers.pop()
+        except IndexError:
+            return None
 
     @property
     def measures_delay(self) -> bool:

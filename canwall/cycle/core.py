@@ -17,6 +17,7 @@ from canwall.compiled import Record, compiled
 from canwall.cycle.state import CYCLE
 from canwall.cycle.step import step
 from canwall.cycle.timing import HISTOGRAM, observe_ns
+from canwall.record.append import put_frame, put_row
 from canwall.record.columns import ROW
 from canwall.record.ring import (
     ERROR,
@@ -27,8 +28,6 @@ from canwall.record.ring import (
     RECEIVED,
     REMOTE,
     ROWS,
-    put_frame,
-    put_row,
 )
 
 #: Last part of a wait, which is a busy one because the end of a sleep is not precise.

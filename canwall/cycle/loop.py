@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 
 import can
 
-from canwall import config
 from canwall.cycle.axis import WallAxis, WallStage
 from canwall.cycle.exchange import Exchange
 from canwall.cycle.state import fade_in, fade_over, set_delay, set_limits, set_wall, start_at
@@ -327,15 +326,12 @@ class Loop:
 
 def _change(axis: WallAxis, changes: list[WallStage], period: float) -> None:
     """Apply the changes of wall and limits that are due, each after the previous is complete."""
-    cycle, mailbox = axis.cycle, axis.mailbox
+    cycle = axis.cycle
     if cycle["fade_left"][0]:
         return
     j = int(cycle["j"][0])
     due = bool(changes) and changes[0].j <= j
     turns = len(axis.turns) > 1 and cycle["strikes"][0] >= axis.next_turn
-    if not (due or turns or (mailbox is not None and mailbox.waiting())):
-        return
-    fade_over(cycle, round(axis.settings.run.blend_s / period))
     if turns:
         axis.wall = axis.turns[axis.next_turn % len(axis.turns)]
         axis.next_turn += 1
@@ -343,14 +339,25 @@ def _change(axis: WallAxis, changes: list[WallStage], period: float) -> None:
         change = changes.pop(0)
         axis.wall, axis.limits = change.wall, change.limits
         axis.turns = axis.settings.laws_in_turn(change.wall)
-    if mailbox is not None and mailbox.waiting():
-        posted = config.WallChange.model_validate_json(mailbox.take(j))
-        axis.wall, axis.limits = posted.applied_to(axis.wall, axis.limits)
-        # A requested law ends the alternation; other changes apply to all alternating walls.
-        walls = [axis.wall] if posted.law else axis.turns
-        axis.turns = [posted.applied_to(wall, axis.limits)[0] for wall in walls]
+    if not (due or turns) and not _accept_offer(axis, j):
+        return
+    axis.revision += 1
+    fade_over(cycle, round(axis.settings.run.blend_s / period))
     set_wall(cycle, axis.wall, axis.laws)
     set_limits(cycle, axis.limits)
+
+
+def _accept_offer(axis: WallAxis, j: int) -> bool:
+    """Take a requested change over if it was judged against what is in force."""
+    offer = axis.take_offer()
+    if offer is None:
+        return False
+    if offer.revision != axis.revision:
+        offer.outdated = True
+        return False
+    axis.wall, axis.limits, axis.turns = offer.wall, offer.limits, offer.turns
+    offer.since = j
+    return True
 
 
 def _advance_enabling(axis: WallAxis, way: Enabling) -> bool:

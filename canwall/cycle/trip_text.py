@@ -57,11 +57,19 @@ def trip_text(axis: WallAxis, exchange: Exchange) -> str:
         case Trip.REPORTED:
             what = axis.reported
         case _:
-            law = axis.laws[int(cycle["rendered"]["law"][0])].name
-            what = f"law {law} failed, or gave a force that is not a number"
+            what = _failed_law(axis)
     if trip in (Trip.NOT_ENABLED, Trip.REPORTED):
         what += _pause(axis, exchange)
     return f"cycle {j} ({j * float(cycle['period']):.3f} s): {what}"
+
+
+def _failed_law(axis: WallAxis) -> str:
+    """Describe what went wrong in the law, or in the one before while they are blended."""
+    present, before = (int(axis.cycle[wall]["law"][0, 0]) for wall in ("rendered", "faded"))
+    for law in (axis.laws[i] for i in (present, before) if i >= 0):
+        if failure := law.failure():
+            return f"law {law.name} raised {failure}"
+    return f"law {axis.laws[present].name} gave a force that is not a number"
 
 
 def _jump_key(axis: WallAxis) -> str:

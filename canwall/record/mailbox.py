@@ -1,7 +1,7 @@
 """Changes of a wall during a run, posted by another process one at a time in shared memory.
 
-A change is a text that the sender has checked. The loop looks for one between two cycles, takes it
-as a whole, and notes the cycle. The loop never waits; the sender waits for that note.
+A change is a text. The run that owns the mailbox answers it with the cycle from which on it is in
+force, or with the reason why it is not; the sender waits for that.
 """
 
 import fcntl
@@ -11,11 +11,21 @@ import time
 
 import numpy as np
 
-#: Changes posted by senders, changes taken by the loop, the cycle of the last one, its length.
-_HEADER = np.dtype([("posted", "i8"), ("taken", "i8"), ("at", "i8"), ("length", "i8")], align=True)
+from canwall.errors import ConfigError
+from canwall.record.memory_order import fence
+
+#: Numbers of changes posted and answered, the number of the one that its sender has withdrawn, the
+#: cycle of the last answer, the length of the text: a change, or the reason of a refusal.
+_HEADER = np.dtype(
+    [(name, "i8") for name in ("posted", "answered", "withdrawn", "at", "length")], align=True
+)
 _TEXT = 4096
 _SIZE = _HEADER.itemsize + _TEXT
 _POLL_S = 0.001
+#: Cycle of a change that was refused.
+_REFUSED = -1
+#: Time for an answer that crosses with a withdrawal [s].
+_LAST_ANSWER_S = 1.0
 
 
 class Mailbox:
@@ -25,7 +35,8 @@ class Mailbox:
         self._descriptor = descriptor
         self._memory = mmap.mmap(descriptor, _SIZE)
         self._header = np.frombuffer(self._memory, _HEADER, 1)
-        self._posted, self._taken = self._header["posted"], self._header["taken"]
+        self._posted, self._answered = self._header["posted"], self._header["answered"]
+        self._withdrawn = self._header["withdrawn"]
 
     @classmethod
     def create(cls) -> "Mailbox":
@@ -49,43 +60,75 @@ class Mailbox:
         os.close(self._descriptor)
 
     def waiting(self) -> bool:
-        """Return True if a change is waiting; called by the loop."""
-        return bool(self._posted[0] != self._taken[0])
+        """Return True if a change waits for its answer."""
+        return bool(self._posted[0] != self._answered[0])
 
-    def take(self, cycle: int) -> str:
-        """Return the waiting change, in force from this cycle on; called by the loop."""
-        length = int(self._header["length"][0])
-        text = self._memory[_HEADER.itemsize : _HEADER.itemsize + length].decode()
+    def withdrawn(self) -> bool:
+        """Return True if the sender of the waiting change has given up."""
+        return bool(self._posted[0] == self._withdrawn[0])
+
+    def text(self) -> bytes:
+        """Return the waiting change, whatever another process has written; called by the run."""
+        fence()
+        return self._text()
+
+    def accept(self, cycle: int) -> None:
+        """Answer the waiting change: it is in force from this cycle on; called by the run."""
+        self._answer(cycle, "")
+
+    def refuse(self, reason: str) -> None:
+        """Answer the waiting change: it does not come into force; called by the run."""
+        self._answer(_REFUSED, reason)
+
+    def _answer(self, cycle: int, reason: str) -> None:
+        self._write(reason.encode(errors="replace")[:_TEXT])
         self._header["at"] = cycle
-        self._taken[0] = self._posted[0]
-        return text
+        fence()
+        self._answered[0] = self._posted[0]
 
     def post(self, text: str, timeout_s: float) -> int:
-        """Post a change and wait until it is taken; called by the sender.
+        """Post a change and wait for the answer; called by the sender.
 
-        Returns the cycle from which on it is in force. Raises ValueError for a text that is too
-        long, TimeoutError if the loop does not take it in time.
+        Returns the cycle from which on it is in force. Raises ConfigError with the reason if it is
+        refused, and TimeoutError if it is not answered in time; it does not come into force then.
         """
         data = text.encode()
         if len(data) > _TEXT:
-            raise ValueError(f"a change of {len(data)} bytes; {_TEXT} is the most")
+            raise ConfigError(f"a change of {len(data)} bytes; {_TEXT} is the most")
         deadline = time.monotonic() + timeout_s
         # One sender at a time; the lock is released when its holder dies.
         fcntl.flock(self._descriptor, fcntl.LOCK_EX)
         try:
-            while self.waiting():
-                _wait(deadline)
-            self._memory[_HEADER.itemsize : _HEADER.itemsize + len(data)] = data
-            self._header["length"] = len(data)
+            self._wait(deadline)
+            self._write(data)
+            fence()
             self._posted[0] += 1
-            while self.waiting():
-                _wait(deadline)
-            return int(self._header["at"][0])
+            try:
+                self._wait(deadline)
+            except TimeoutError:
+                self._withdrawn[0] = self._posted[0]
+                # It may have been taken at the same moment.
+                self._wait(time.monotonic() + _LAST_ANSWER_S)
+            fence()
+            cycle = int(self._header["at"][0])
+            if cycle != _REFUSED:
+                return cycle
+            if self.withdrawn():
+                raise TimeoutError
+            raise ConfigError(self._text().decode(errors="replace"))
         finally:
             fcntl.flock(self._descriptor, fcntl.LOCK_UN)
 
+    def _wait(self, deadline: float) -> None:
+        while self.waiting():
+            if time.monotonic() >= deadline:
+                raise TimeoutError
+            time.sleep(_POLL_S)
 
-def _wait(deadline: float) -> None:
-    if time.monotonic() >= deadline:
-        raise TimeoutError
-    time.sleep(_POLL_S)
+    def _text(self) -> bytes:
+        length = min(max(int(self._header["length"][0]), 0), _TEXT)
+        return self._memory[_HEADER.itemsize : _HEADER.itemsize + length]
+
+    def _write(self, data: bytes) -> None:
+        self._memory[_HEADER.itemsize : _HEADER.itemsize + len(data)] = data
+        self._header["length"] = len(data)

@@ -1,7 +1,8 @@
 """Ring buffers in shared memory that carry the rows and frames of a run to the writer.
 
 Each of the two rings (cycles and frames) has one producer and one consumer, and each side owns one
-counter: the head counts the items put in, the tail the items taken out. Neither is ever reset.
+counter: the head counts the items put in (`append`), the tail the items taken out. Neither is ever
+reset.
 """
 
 import mmap
@@ -11,8 +12,9 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
-from canwall.compiled import Record, compiled, data_to_number, number_to_data
+from canwall.compiled import data_to_number, number_to_data
 from canwall.record.columns import ROW
+from canwall.record.memory_order import fence
 
 #: Bits of a FRAME's flags.
 RECEIVED, REMOTE, ERROR, EXTENDED = 1, 2, 4, 8
@@ -82,6 +84,8 @@ class Ring:
 
     def log_frame(self, time_s: float, message: can.Message, received: bool) -> None:
         """Put in a frame (a `drive.FrameLog`)."""
+        from canwall.record.append import put_frame  # the writer spares itself numba
+
         flags = (
             RECEIVED * received
             | REMOTE * message.is_remote_frame
@@ -115,7 +119,9 @@ class Ring:
 
     def _take(self, ring: NDArray[np.void], head: str, tail: str) -> NDArray[np.void]:
         start, stop = int(self.header[tail][0]), int(self.header[head][0])
+        fence()
         taken = ring[np.arange(start, stop) % len(ring)]
+        fence()
         self.header[tail] = stop
         return taken
 
@@ -135,38 +141,3 @@ def to_message(frame: NDArray[np.void], channel: str) -> can.Message:
         data=None if remote else number_to_data(int(frame["data"]), length),
         channel=channel,
     )
-
-
-@compiled
-def put_frame(
-    headers: NDArray[np.void],
-    frames: NDArray[np.void],
-    time_s: float,
-    can_id: int,
-    flags: int,
-    length: int,
-    data: int,
-) -> None:
-    """Append a frame, or count it as lost if the consumer is too far behind."""
-    header: Record = headers[0]
-    if header.frame_head - header.frame_tail >= len(frames):
-        header.frames_lost += 1
-        return
-    frame: Record = frames[header.frame_head % len(frames)]
-    frame.time_s = time_s
-    frame.can_id = can_id
-    frame.flags = flags
-    frame.length = length
-    frame.data = data
-    header.frame_head += 1
-
-
-@compiled
-def put_row(headers: NDArray[np.void], ring: NDArray[np.void], rows: NDArray[np.void]) -> None:
-    """Append a row (array of shape (1,)), or count it as lost."""
-    header: Record = headers[0]
-    if header.row_head - header.row_tail >= len(ring):
-        header.rows_lost += 1
-        return
-    ring[header.row_head % len(ring)] = rows[0]
-    header.row_head += 1

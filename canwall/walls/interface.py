@@ -102,6 +102,7 @@ class Law:
     Attributes:
         name: Name in configurations and summaries.
         options: Names and defaults of what `[wall.options]` may set.
+        failure: Returns what the last call raised, empty if nothing.
     """
 
     def __init__(
@@ -110,6 +111,7 @@ class Law:
         function: Callable[[Any], float],
         options: Mapping[str, float],
         cached: bool = True,
+        failure: Callable[[], str] = lambda: "",
     ) -> None:
         """Declare a law; nothing is compiled yet.
 
@@ -120,6 +122,7 @@ class Law:
         self.options = options
         self._function = function
         self._cached = cached
+        self.failure = failure
         self._compiled: Any = None
         self._compiling = threading.Lock()
 

@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 
 from canwall.config import ConfigError
 from canwall.record import ROW, Recorder, RecordError, Ring, RunFolder, read_signals
+from canwall.record.append import put_frame, put_row
 from canwall.record.columns import schema
-from canwall.record.ring import FRAMES, ROWS, put_frame, put_row, to_message
+from canwall.record.ring import FRAMES, ROWS, to_message
 
 LAWS = ["standard", "half_sample"]
 PATIENCE_S = 30.0

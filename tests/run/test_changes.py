@@ -1,10 +1,13 @@
 """A wall that is changed from outside while it is rendered."""
 
 import json
+import re
 import signal
 import threading
-import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +23,7 @@ from rig import Loop, RigFactory, settings_with
 
 from canwall import config
 from canwall.config import ConfigError
+from canwall.cycle import Outcome, WallStage
 from canwall.errors import RunFailedError
 from canwall.record import Mailbox, RunFolder, read_signals
 from canwall.run.changes import open_to_changes, post_change
@@ -29,7 +33,7 @@ PATIENCE_S = 60.0
 
 def test_mailbox_hands_over_one_change_at_a_time() -> None:
     mailbox = Mailbox.create()
-    taken: list[str] = []
+    taken: list[bytes] = []
     answers: list[int] = []
 
     def post(k: int) -> None:
@@ -43,22 +47,88 @@ def test_mailbox_hands_over_one_change_at_a_time() -> None:
         sender.start()
     while len(taken) < len(senders):
         if mailbox.waiting():
-            taken.append(mailbox.take(100 + len(taken)))
+            taken.append(mailbox.text())
+            mailbox.accept(100 + len(taken))
     for sender in senders:
         sender.join()
-    assert sorted(taken) == [f"change {k}" for k in range(5)]
-    assert sorted(answers) == [100, 101, 102, 103, 104]
+    assert sorted(taken) == [f"change {k}".encode() for k in range(5)]
+    assert sorted(answers) == [101, 102, 103, 104, 105]
     assert not mailbox.waiting()
     other = Mailbox.open(mailbox.address)
-    with pytest.raises(ValueError, match="4096 is the most"):
+    with pytest.raises(ConfigError, match="4096 is the most"):
         other.post("x" * 5000, PATIENCE_S)
-    with pytest.raises(TimeoutError):
-        other.post("nobody takes this", 0.01)
     other.close()
     address = mailbox.address
     mailbox.close()
     with pytest.raises(OSError, match="No such file"):
         Mailbox.open(address)
+
+
+@contextmanager
+def answering(answer: Callable[[Mailbox], None]) -> Iterator[Mailbox]:
+    """Yield a sender's mailbox; the answer is given once a change waits in the owner's."""
+    mailbox = Mailbox.create()
+
+    def wait_and_answer() -> None:
+        wait_for(mailbox.waiting)
+        answer(mailbox)
+
+    owner = threading.Thread(target=wait_and_answer)
+    owner.start()
+    sender = Mailbox.open(mailbox.address)
+    yield sender
+    owner.join()
+    sender.close()
+    mailbox.close()
+
+
+def test_refusal_reaches_the_sender() -> None:
+    def refuse(mailbox: Mailbox) -> None:
+        mailbox.refuse(f"{mailbox.text().decode()}? No")
+
+    with (
+        answering(refuse) as sender,
+        pytest.raises(ConfigError, match=re.escape("a change? No")),
+    ):
+        sender.post("a change", PATIENCE_S)
+
+
+def test_change_that_is_not_taken_in_time_is_withdrawn() -> None:
+    def drop(mailbox: Mailbox) -> None:
+        wait_for(mailbox.withdrawn)
+        mailbox.refuse("too late")
+
+    with answering(drop) as sender, pytest.raises(TimeoutError):
+        sender.post("a change", 0.01)
+
+
+def test_change_that_is_taken_as_it_is_withdrawn_is_in_force() -> None:
+    def take(mailbox: Mailbox) -> None:
+        wait_for(mailbox.withdrawn)
+        mailbox.accept(7)
+
+    with answering(take) as sender:
+        assert sender.post("a change", 0.01) == 7
+
+
+def test_text_and_answer_lie_between_fences(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The text before the number that announces it, for sender and owner."""
+    mailbox = Mailbox.create()
+    states: list[tuple[bytes, bool]] = []
+
+    def note() -> None:
+        states.append((mailbox._text(), mailbox.waiting()))
+
+    monkeypatch.setattr("canwall.record.mailbox.fence", note)
+    sender = threading.Thread(target=mailbox.post, args=("a change", PATIENCE_S))
+    sender.start()
+    wait_for(mailbox.waiting)
+    assert states == [(b"a change", False)]
+    assert mailbox.text() == b"a change"
+    mailbox.accept(3)
+    sender.join()
+    assert states[1:] == [(b"a change", True), (b"", True), (b"", False)]
+    mailbox.close()
 
 
 def test_change_is_in_force_from_the_cycle_that_it_is_told(
@@ -82,8 +152,7 @@ def test_change_is_in_force_from_the_cycle_that_it_is_told(
         if j in (300, 600):
             senders.append(threading.Thread(target=post, args=(wanted[len(senders)],)))
             senders[-1].start()
-            while loop.axis.mailbox is None or not loop.axis.mailbox.waiting():
-                time.sleep(0.001)
+            wait_for(lambda: bool(loop.axis.offers))
         return False
 
     with open_to_changes([loop.axis], [folder]):
@@ -124,24 +193,157 @@ def test_run_of_the_command_is_changed_by_the_command(start: Start, tmp_path: Pa
     assert stiffness[cycle - 1] == 2.0
 
 
+class Bench:
+    """A run that is open to changes, and a person who asks for them."""
+
+    def __init__(
+        self, make_rig: RigFactory, path: Path, values: dict[str, Any], **wall: Any
+    ) -> None:
+        settings = settings_with(values)
+        of_wall = settings.wall.model_copy(update=wall)
+        self.settings = settings.model_copy(update={"schedule": (), "wall": of_wall})
+        self.loop = Loop(make_rig(self.settings))
+        self.folder = RunFolder(path)
+        self.answers: list[int | str] = []
+        self._sender: threading.Thread | None = None
+
+    def ask(self, *assignments: str) -> None:
+        """Ask for a change, and wait until it is offered to the loop or refused."""
+
+        def post() -> None:
+            try:
+                self.answers.append(post_change(self.folder, assignments))
+            except (ConfigError, RunFailedError) as error:
+                self.answers.append(str(error))
+
+        if self._sender is not None:
+            self._sender.join()
+        answered = len(self.answers)
+        self._sender = threading.Thread(target=post)
+        self._sender.start()
+        wait_for(lambda: bool(self.loop.axis.offers) or len(self.answers) > answered)
+
+    def run(self, requests: dict[int, Callable[[], None]], **of_run: Any) -> Outcome:
+        """Run, and do something between two cycles."""
+
+        def at(j: int) -> bool:
+            if j in requests:
+                requests[j]()
+            return False
+
+        with open_to_changes([self.loop.axis], [self.folder]):
+            outcome = self.loop.run(1000, at, **of_run)
+        if self._sender is not None:
+            self._sender.join()
+        return outcome
+
+
 @pytest.mark.parametrize(
-    ("assignment", "message"),
+    ("assignments", "message"),
     [
-        ("stifness_nm_per_rad=1", "stifness_nm_per_rad: unknown key; did you mean stiffness_nm"),
-        ("stiffness_nm_per_rad=-1", "stiffness_nm_per_rad: has to be greater than or equal to 0"),
-        ("limits.torque=1", "limits.torque: unknown key; did you mean torque_nm?"),
-        ("position_rad=7", "position_rad = 7 lies outside the run's limits.position_rad"),
-        ("law=nothing", "law: unknown law 'nothing'"),
-        ("law=midpoint", "law midpoint is not one of the run's: standard, half_sample; list it"),
+        (["position_rad=7"], "position_rad = 7 lies outside the run's limits.position_rad"),
+        (["law=nothing"], "law: unknown law 'nothing'"),
+        (["law=midpoint"], "law midpoint is not one of the run's: exponential, standard; list it"),
+        (["law=mine.py:mine"], "is not one of the run's: exponential, standard; list it"),
+        (["options.length=0.01"], "law: law standard has no option 'length'; it has none"),
+        (["deadbeat=true"], "law: law standard has no deadbeat compensation; half_sample,"),
+        (["law=standard", "options.length=0.01"], "law: law standard has no option 'length'"),
     ],
 )
-def test_impossible_change_is_not_posted(tmp_path: Path, assignment: str, message: str) -> None:
+def test_change_that_the_wall_in_force_does_not_allow_is_refused(
+    make_rig: RigFactory, tmp_path: Path, assignments: list[str], message: str
+) -> None:
+    """The wall in force is the standard one, although the run began with the exponential."""
+    bench = Bench(
+        make_rig,
+        tmp_path,
+        {"wall.law": "exponential", "run.more_laws": ["standard"], "run.blend_s": 0.02},
+    )
+    requests = {
+        300: lambda: bench.ask("options.length=0.01"),
+        400: lambda: bench.ask("law=standard"),
+        500: lambda: bench.ask(*assignments),
+        600: lambda: bench.ask("stiffness_nm_per_rad=33"),
+    }
+    outcome = bench.run(requests)
+    assert outcome.trips == []
+    assert bench.answers[:2] == [300, 400]
+    assert message in str(bench.answers[2])
+    assert bench.answers[3:] == [600]
+
+
+def test_options_of_one_law_are_refused_while_others_alternate(
+    make_rig: RigFactory, tmp_path: Path
+) -> None:
+    bench = Bench(make_rig, tmp_path, {"wall.law": "exponential"}, alternate=("standard",))
+    outcome = bench.run({300: lambda: bench.ask("options.length=0.01")})
+    assert outcome.trips == []
+    assert bench.answers == ["law: law standard has no option 'length'; it has none"]
+
+
+def test_change_is_judged_anew_when_another_one_comes_first(
+    make_rig: RigFactory, tmp_path: Path
+) -> None:
+    """The schedule exchanges the law while a change of the former law's options is on its way."""
+    bench = Bench(
+        make_rig,
+        tmp_path,
+        {"wall.law": "exponential", "run.more_laws": ["standard"], "run.blend_s": 0.02},
+    )
+    standard = bench.settings.wall.model_copy(update={"law": "standard", "options": {}})
+    stages = [WallStage(300, standard, bench.settings.limits)]
+    outcome = bench.run({300: lambda: bench.ask("options.length=0.01")}, changes=stages)
+    assert outcome.trips == []
+    assert bench.answers == ["law: law standard has no option 'length'; it has none"]
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"law": 3}', '{"nothing": 1}', "\0" * 4096])
+def test_rubbish_in_the_mailbox_is_refused(make_rig: RigFactory, tmp_path: Path, text: str) -> None:
+    bench = Bench(make_rig, tmp_path, {})
+    refused: list[str] = []
+
+    def post() -> None:
+        mailbox = Mailbox.open(json.loads(bench.folder.live.read_text())["mailbox"])
+        with pytest.raises(ConfigError) as error:
+            mailbox.post(text, PATIENCE_S)
+        refused.append(str(error.value))
+        mailbox.close()
+
+    assert bench.run({300: post}).trips == []
+    assert len(refused) == 1
+
+
+def test_change_that_waits_at_the_end_of_the_run_is_refused(
+    make_rig: RigFactory, tmp_path: Path
+) -> None:
+    bench = Bench(make_rig, tmp_path, {})
+    with open_to_changes([bench.loop.axis], [bench.folder]):
+        bench.ask("stiffness_nm_per_rad=20")
+    wait_for(lambda: bool(bench.answers))
+    assert bench.answers == ["the run has ended"]
+    assert bench.loop.axis.offers == []
+
+
+@pytest.mark.parametrize(
+    ("assignments", "message"),
+    [
+        (
+            ["stifness_nm_per_rad=1"],
+            "stifness_nm_per_rad: unknown key; did you mean stiffness_nm",
+        ),
+        (["stiffness_nm_per_rad=-1"], "stiffness_nm_per_rad: has to be greater than or equal to 0"),
+        (["limits.torque=1"], "limits.torque: unknown key; did you mean torque_nm?"),
+        (["options=1", "options.length=2"], "options.length: options has a value of its own"),
+    ],
+)
+def test_impossible_change_is_not_posted(
+    tmp_path: Path, assignments: list[str], message: str
+) -> None:
     folder = RunFolder(tmp_path)
-    folder.config.write_text(settings_with().to_toml())
     mailbox = Mailbox.create()
     folder.live.write_text(json.dumps({"mailbox": mailbox.address}))
     with pytest.raises(ConfigError) as error:
-        post_change(folder, [assignment])
+        post_change(folder, assignments)
     assert str(error.value).startswith(message)
     assert not mailbox.waiting()
     mailbox.close()
@@ -151,10 +353,11 @@ def test_run_that_is_over_takes_no_change(tmp_path: Path, monkeypatch: pytest.Mo
     folder = RunFolder(tmp_path)
     with pytest.raises(ConfigError, match="no run in progress"):
         post_change(folder, ["stiffness_nm_per_rad=1"])
-    folder.config.write_text(settings_with().to_toml())
     mailbox = Mailbox.create()
     folder.live.write_text(json.dumps({"mailbox": mailbox.address}))
     monkeypatch.setattr("canwall.run.changes._PATIENCE_S", 0.01)
+    monkeypatch.setattr("canwall.record.mailbox._LAST_ANSWER_S", 0.01)
     with pytest.raises(RunFailedError, match="does not take the change"):
         post_change(folder, ["stiffness_nm_per_rad=1"])
+    assert mailbox.withdrawn()
     mailbox.close()

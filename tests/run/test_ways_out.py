@@ -287,11 +287,20 @@ def test_writer_that_is_killed_takes_nothing_with_it(start: Start, tmp_path: Pat
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "body",
-    ["return math.nan", "return wall.memory[int(1e6 * wall.y_sample)]", 'raise ValueError("no")'],
+    ("body", "words"),
+    [
+        ("return math.nan", "gave a force that is not a number"),
+        (
+            "return wall.memory[int(1e6 * wall.y_sample)]",
+            "raised IndexError: index is out of bounds (failing.py, line 5)",
+        ),
+        ('raise ValueError("no")', "raised ValueError: no (failing.py, line 5)"),
+    ],
 )
 @pytest.mark.parametrize("exchange", ["python-can", "native"])
-def test_law_that_fails_in_the_contact(tmp_path: Path, body: str, exchange: str) -> None:
+def test_law_that_fails_in_the_contact(
+    tmp_path: Path, body: str, words: str, exchange: str
+) -> None:
     file = tmp_path / "failing.py"
     file.write_text(
         "import math\n\ndef failing(wall):\n    if wall.y_sample < -0.002:\n        "
@@ -306,7 +315,7 @@ def test_law_that_fails_in_the_contact(tmp_path: Path, body: str, exchange: str)
     )
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
-    assert line.endswith(f"law {file}:failing failed, or gave a force that is not a number")
+    assert line.endswith(f"law {file}:failing {words}")
     record = Record(folder)
     trip = record.summary["trip_cycle"]
     torques = record.column("torque_cmd_per_mille")

@@ -158,24 +158,44 @@ def test_helpers_constants_memory_and_plain_integers(write: Write) -> None:
         ("def other(wall):\n    return 0.0\n", "the file has no such function"),
         ("def mine(wall)\n    return 0.0\n", "SyntaxError: expected ':' (mine.py, line 1)"),
         ("import nowhere\n", "ModuleNotFoundError: No module named 'nowhere'"),
-        ("def mine(wall):\n    pass\n", "does not compile: No conversion from none to float64"),
-        ("def mine(wall):\n    return 'a'\n", "does not compile: "),
+        ("def mine(wall):\n    pass\n", "line 2: returns None; a law returns a number"),
+        (
+            "def mine(wall):\n    if wall.y < 0.0:\n        return 1.0\n",
+            "line 2: returns None; a law returns a number, on every way through it",
+        ),
+        ("def mine(wall):\n    return 'a'\n", "line 2: returns a string; a law returns a number"),
+        (
+            "def mine(wall):\n    if wall.y < 0.0:\n        return 1.0\n    return 'a'\n",
+            "line 4: does not compile: Can't unify return type",
+        ),
+        ("def mine(wall):\n    return wall.y, 1.0\n", "line 2: returns UniTuple"),
+        ("def mine(wall):\n    return 1j * wall.y\n", "line 2: returns complex128; a law"),
         (
             "def helper(x):\n    return x\ndef mine(wall):\n    return helper(wall.y)\n",
-            "does not compile: Untyped global name 'helper'",
+            "line 4: does not compile: Untyped global name 'helper'",
         ),
         (
             "def mine(wall):\n    return wall.stifness\n",
-            "reads stifness, which is neither a field of the wall nor an option; "
-            "did you mean stiffness?",
+            "line 2: uses stifness, which is neither a field of the wall nor an option; "
+            "did you mean stiffness? (fields: stiffness, damping, mass, viscous, spring, period, ",
+        ),
+        (
+            "from numba import njit\n@njit\ndef helper(wall):\n    return wall.stifness\n"
+            "def mine(wall):\n    return helper(wall)\n",
+            "line 4: uses stifness, which is neither a field of the wall nor an option",
+        ),
+        (
+            "def mine(wall):\n    wall.hardness = 1.0\n    return 0.0\n",
+            "line 2: uses hardness, which is neither a field of the wall nor an option",
         ),
         (
             "OPTIONS = {'growth': 1}\ndef mine(wall):\n    return wall.options.grwth\n",
-            "reads grwth, which is neither a field of the wall nor an option; did you mean growth?",
+            "line 3: uses grwth, which is neither a field of the wall nor an option; "
+            "did you mean growth? (fields: ",
         ),
         (
             "def mine(wall):\n    return wall.options.growth\n",
-            "reads wall.options, but its file declares no OPTIONS",
+            "line 2: uses wall.options, but its file declares no OPTIONS",
         ),
         ("def mine(wall, y):\n    return y\n", "takes 2 arguments; a law takes one, the wall"),
         ("import math\nmath.nowhere\n", "AttributeError: module 'math' has no attribute 'nowhere'"),
@@ -201,6 +221,27 @@ def test_one_line_for_what_is_wrong(write: Write, text: str, complaint: str) -> 
     assert "\n" not in message
 
 
+@pytest.mark.parametrize(
+    ("line", "text"),
+    [
+        (3, "def mine(wall):\n    return wall.options[0]\n"),
+        (4, "def mine(wall):\n    o = wall.options\n    return o[0] + o.growth\n"),
+        (3, "def mine(wall):\n    wall.options[0] = 2.0\n    return 0.0\n"),
+        (3, "def mine(wall):\n    return wall[0]\n"),
+        (
+            5,
+            "from numba import njit\n@njit\ndef first(options):\n    return options[0]\n"
+            "def mine(wall):\n    return first(wall.options)\n",
+        ),
+    ],
+)
+def test_fields_are_not_read_by_position(write: Write, line: int, text: str) -> None:
+    name = write("OPTIONS = {'growth': 1}\n" + text)
+    with pytest.raises(UnknownLawError) as caught:
+        find_law(name)
+    assert str(caught.value).startswith(f"{name}: line {line}: uses a field by its position; use")
+
+
 def test_one_line_for_a_file_that_is_not_there(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("def mine(wall):\n    return 0.0\n")
     for file, complaint in (
@@ -224,26 +265,48 @@ def test_run_says_it_in_one_line(write: Write, tmp_path: Path) -> None:
     done = command("run", "--law", law, "--output", tmp_path / "run")
     (line,) = done.stderr.splitlines()
     assert line.startswith("canwall: ")
-    assert f"{law}: does not compile: No conversion from none" in line
+    assert f"{law}: line 2: returns None; a law returns a number" in line
     assert done.returncode == 2
     assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
-    "body",
+    ("body", "raised"),
     [
-        "raise ValueError('no')",
-        "return wall.memory[int(wall.stiffness)]",  # far beyond its end
-        "return 1 // int(wall.y)",
+        ("raise ValueError('no')", "ValueError: no"),
+        # Far beyond its end.
+        ("return wall.memory[int(wall.stiffness)]", "IndexError: index is out of bounds"),
+        ("return 1 // int(wall.y)", "ZeroDivisionError: integer division by zero"),
+        ("return 1.0 / (wall.y - wall.y)", "ZeroDivisionError: division by zero"),
     ],
 )
-def test_exception_in_a_law_is_a_nan_force(tmp_path: Path, body: str) -> None:
+def test_exception_in_a_law_is_a_nan_force_and_is_told(
+    tmp_path: Path, body: str, raised: str
+) -> None:
     file = tmp_path / "raises.py"
-    file.write_text(f"def raises(wall):\n    if wall.y < 0.0:\n        {body}\n    return 0.25\n")
+    file.write_text(
+        "def raises(wall):\n"
+        "    wall.memory[1] += 1.0\n"
+        "    if wall.y < 0.0 and wall.memory[1] == 2.0:\n"
+        f"        {body}\n"
+        "    return 0.25\n"
+    )
     found = find_law(f"{file}:raises")
     bench = np.zeros(1, WALL)
     bench["stiffness"] = 50.0
     bench["y"] = 0.1
     assert wall_force(found.address, bench[0]) == 0.25
+    assert found.failure() == ""
     bench["y"] = -0.1
     assert not np.isfinite(wall_force(found.address, bench[0]))
+    # The exception of that call, although the law would not raise it in the state that it left.
+    for _ in range(2):
+        assert found.failure() == f"{raised} (raises.py, line 4)"
+    assert wall_force(found.address, bench[0]) == 0.25
+    assert found.failure() == ""
+
+
+def test_force_that_is_no_number_is_no_exception(write: Write) -> None:
+    found = find_law(write("import math\ndef mine(wall):\n    return math.nan\n"))
+    assert not np.isfinite(wall_force(found.address, np.zeros(1, WALL)[0]))
+    assert found.failure() == ""

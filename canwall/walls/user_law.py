@@ -1,0 +1,267 @@
+"""A user's law, named by file and function: `my_law.py:my_law`.
+
+The function takes one record (`interface.WALL`) and returns the force. If the file has a dictionary
+OPTIONS, `[wall.options]` may set its entries, and the function reads them by name:
+`wall.options.growth`.
+"""
+
+import difflib
+import dis
+import importlib.util
+import inspect
+import keyword
+import math
+import os
+import re
+import traceback
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import FunctionType, ModuleType
+from typing import Any
+
+import numpy as np
+from numba import from_dtype, njit, types
+from numba.core import cgutils, ir
+from numba.core.errors import NumbaError
+from numba.extending import intrinsic
+
+from canwall.walls.interface import MAX_OPTIONS, Law, UnknownLawError, wall_with
+
+
+def load_law(path: Path, function: str) -> Law:
+    """Return the law of a function in a file, compiled. Raises UnknownLawError."""
+    where = f"{path}:{function}"
+    if not os.path.isfile(path):  # Path.is_file raises for names that are too long
+        raise UnknownLawError(f"{where}: no such file")
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    if spec is None or spec.loader is None:
+        raise UnknownLawError(f"{where}: not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:  # whatever the user's file does when it is run
+        raise UnknownLawError(f"{where}: {type(error).__name__}: {_gist(error)}") from None
+    written = getattr(module, function, None)
+    if not isinstance(written, FunctionType):
+        raise UnknownLawError(f"{where}: the file has no such function")
+    arguments = len(inspect.signature(written).parameters)
+    if arguments != 1:
+        raise UnknownLawError(f"{where}: takes {arguments} arguments; a law takes one, the wall")
+    options = _declared_options(where, getattr(module, "OPTIONS", {}))
+    guarded = _Guarded(written, options)
+    law = Law(where, guarded.function, options, cached=False, failure=guarded.failure)
+    try:
+        _check_types(guarded.compile())
+        law.compile()
+    except UnsuitableLawError as error:
+        raise UnknownLawError(f"{where}: {error}") from None
+    except NumbaError as error:
+        line = _line_in(path, str(error))
+        raise UnknownLawError(f"{where}: {line}does not compile: {_gist(error)}") from None
+    except KeyError as error:  # numba's, for a field that a record does not have
+        name = str(error.args[0])
+        line = _line_of_field(module, name)
+        raise UnknownLawError(f"{where}: {line}{_unknown_field(name, options)}") from None
+    except Exception as error:  # numba lets what it trips over through
+        raise UnknownLawError(f"{where}: {type(error).__name__}: {_gist(error)}") from None
+    return law
+
+
+class UnsuitableLawError(Exception):
+    """A function that compiles, but is no law."""
+
+
+def _declared_options(where: str, options: object) -> Mapping[str, float]:
+    if not (
+        isinstance(options, dict)
+        and all(isinstance(n, str) and isinstance(v, int | float) for n, v in options.items())
+    ):
+        raise UnknownLawError(f"{where}: OPTIONS has to be a dictionary of names and numbers")
+    for name in options:
+        if not name.isidentifier() or keyword.iskeyword(name):
+            raise UnknownLawError(
+                f"{where}: OPTIONS: {name!r} cannot be read as wall.options.{name}; rename it"
+            )
+    if len(options) > MAX_OPTIONS:
+        raise UnknownLawError(
+            f"{where}: {len(options)} options; a law may have up to {MAX_OPTIONS}"
+        )
+    return options
+
+
+def _unknown_field(name: str, options: Mapping[str, float]) -> str:
+    if name == "options":
+        return "uses wall.options, but its file declares no OPTIONS"
+    fields = [f for f in wall_with(options).names or () if f not in ("option_values", "options")]
+    close = difflib.get_close_matches(name, [*fields, *options], n=1)
+    hint = f"; did you mean {close[0]}?" if close else ""
+    declared = f"; options: {', '.join(options)}" if options else ""
+    return (
+        f"uses {name}, which is neither a field of the wall nor an option{hint} "
+        f"(fields: {', '.join(fields)}{declared})"
+    )
+
+
+def _line_of_field(module: ModuleType, name: str) -> str:
+    """Return where a module's functions first use an attribute, as the beginning of a message."""
+    written = [inspect.unwrap(value) for value in vars(module).values() if callable(value)]
+    codes = [function.__code__ for function in written if isinstance(function, FunctionType)]
+    lines = [
+        instruction.positions.lineno
+        for code in codes
+        if code.co_filename == module.__file__
+        for instruction in dis.get_instructions(code)
+        if instruction.argval == name and instruction.positions is not None
+    ]
+    known = [line for line in lines if line is not None]
+    return f"line {min(known)}: " if known else ""
+
+
+def _line_in(path: Path, message: str) -> str:
+    """Return the line of a file that a message of numba's names, as the beginning of a message."""
+    named = re.findall(rf'File ".*?{re.escape(path.name)}", line (\d+)', message)
+    # A message about several returns names all of them; what is no number is wrong.
+    returned = re.findall(r"type '([^']*)', location:[^,]*?, line (\d+)", message)
+    wrong = [line for kind, line in returned if not kind.startswith(("float", "int", "uint"))]
+    line = (wrong or named[-1:])[:1]
+    return f"line {line[0]}: " if line else ""
+
+
+def _check_types(compiled: Any) -> None:
+    """Raise UnsuitableLawError for a value that is no force, or an option read by its position."""
+    annotation = compiled.type_annotation
+    for block in annotation.blocks.values():
+        returned = block.terminator
+        if isinstance(returned, ir.Return):
+            kind = _returned_type(block, returned, annotation.typemap)
+            if not isinstance(kind, types.Number | types.Boolean) or kind in types.complex_domain:
+                raise UnsuitableLawError(
+                    f"line {returned.loc.line}: returns {_shown_type(kind)}; a law returns a "
+                    f"number, on every way through it"
+                )
+    _refuse_positions(annotation)
+
+
+def _returned_type(block: Any, returned: Any, typemap: Mapping[str, Any]) -> Any:
+    """Return the type of a returned value before its cast to the common type of all returns."""
+    for assignment in block.find_insts(ir.Assign):
+        value = assignment.value
+        if (
+            assignment.target.name == returned.value.name
+            and isinstance(value, ir.Expr)
+            and value.op == "cast"
+        ):
+            return types.unliteral(typemap[value.value.name])
+    return types.unliteral(typemap[returned.value.name])
+
+
+def _shown_type(kind: Any) -> str:
+    if kind == types.none:
+        return "None"
+    return "a string" if kind == types.unicode_type else str(kind)
+
+
+def _refuse_positions(annotation: Any) -> None:
+    """Refuse `wall.options[0]`, in the functions that the law calls as well.
+
+    The order of the options is that of their declaration, which nothing else depends on.
+    """
+    typemap = annotation.typemap
+    for block in annotation.blocks.values():
+        accesses = [
+            *block.find_exprs("static_getitem"),
+            *block.find_exprs("getitem"),
+            *block.find_insts(ir.StaticSetItem | ir.SetItem),
+        ]
+        for access in accesses:
+            owner = access.target if isinstance(access, ir.Stmt) else access.value
+            named = isinstance(getattr(access, "index", None), str)
+            if isinstance(typemap[owner.name], types.Record) and not named:
+                raise UnsuitableLawError(
+                    f"line {access.loc.line}: uses a field by its position; use its name, "
+                    f"wall.options.NAME"
+                )
+    for kind in typemap.values():
+        if isinstance(kind, types.Dispatcher):
+            for callee in kind.dispatcher.overloads.values():
+                if hasattr(callee.type_annotation, "blocks"):  # not if it was loaded from disk
+                    _refuse_positions(callee.type_annotation)
+
+
+class _Guarded:
+    """A user's function whose exceptions become a NaN force, on which the run trips.
+
+    Code that is called by address has no caller to raise to. The wall of each call is kept, so that
+    the one that raised can be repeated from Python.
+    """
+
+    def __init__(self, written: FunctionType, options: Mapping[str, float]) -> None:
+        self._written = written
+        self._compiled = njit(error_model="python", boundscheck=True)(written)
+        self._kept = np.zeros(1, wall_with(options))
+
+    def compile(self) -> Any:
+        """Compile the function itself; return numba's result."""
+        signature = (from_dtype(self._kept.dtype),)
+        self._compiled.compile(signature)
+        return self._compiled.overloads[signature]
+
+    @property
+    def function(self) -> Callable[[Any], float]:
+        """The function to be called in its place, not yet compiled."""
+        compiled, kept = self._compiled, self._kept.ctypes.data
+
+        def guarded(wall: Any) -> float:
+            _keep(wall, kept)
+            try:
+                return compiled(wall)
+            except Exception:
+                return math.nan
+
+        return guarded
+
+    def failure(self) -> str:
+        """Return type, message and line of what the last call raised, empty if it did not."""
+        try:
+            self._compiled(self._kept.copy()[0])
+        except Exception as error:
+            return f"{type(error).__name__}: {_gist(error)}{self._place(error)}"
+        return ""
+
+    def _place(self, error: Exception) -> str:
+        """Return file and line of an exception, as the end of a message.
+
+        Compiled code knows them for a `raise`; for the others the function is interpreted.
+        """
+        interpreted: Exception | None = None
+        try:
+            with np.errstate(all="raise"):
+                self._written(self._kept.copy().view(np.recarray)[0])
+        except Exception as repeated:
+            interpreted = repeated
+        for candidate in (error, interpreted):
+            frames = traceback.extract_tb(candidate.__traceback__) if candidate else []
+            places = [f for f in frames if f.filename == self._written.__code__.co_filename]
+            if places:
+                return f" ({Path(places[-1].filename).name}, line {places[-1].lineno})"
+        return ""
+
+
+@intrinsic
+def _keep(typingctx: Any, wall: Any, address: Any) -> Any:
+    """Copy a record to an address."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        place = builder.inttoptr(args[1], args[0].type)
+        size = context.get_constant(types.intp, wall.size)
+        cgutils.raw_memcpy(builder, place, args[0], size, 1)
+        return context.get_dummy_value()
+
+    return types.void(wall, types.uint64), codegen
+
+
+def _gist(error: BaseException) -> str:
+    """Return the line of a message that says most: numba's first ones only name the pipeline."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    telling = [line for line in lines if not line.startswith(("Failed in", "File ", "During"))]
+    return (telling or lines or ["no reason given"])[0]
