@@ -4,6 +4,7 @@ Each of the two rings (cycles and frames) has one producer and one consumer, and
 counter: the head counts the items put in, the tail the items taken out. Neither is ever reset.
 """
 
+import fcntl
 import mmap
 import os
 
@@ -61,7 +62,10 @@ class Ring:
     @classmethod
     def create(cls) -> "Ring":
         """Create an empty ring."""
-        descriptor = os.memfd_create("canwall-record")
+        memory = os.memfd_create("canwall-record")
+        # The writer has standard streams in place of whatever was closed here.
+        descriptor = fcntl.fcntl(memory, fcntl.F_DUPFD_CLOEXEC, 3)
+        os.close(memory)
         os.ftruncate(descriptor, cls.size())
         return cls(descriptor)
 

@@ -4,7 +4,6 @@ The run leaves the address of a mailbox in its folder. A change is validated aga
 configuration before it is posted, so the loop can apply it without checks.
 """
 
-import json
 import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -30,7 +29,7 @@ def open_to_changes(axes: Sequence[WallAxis], folders: Sequence[RunFolder]) -> I
         for axis, folder in zip(axes, folders, strict=True):
             axis.mailbox = Mailbox.create()
             stack.callback(axis.mailbox.close)
-            folder.live.write_text(json.dumps({"mailbox": axis.mailbox.address}))
+            folder.write_live(axis.mailbox.address)
             stack.callback(folder.live.unlink, missing_ok=True)
         yield
 
@@ -50,9 +49,8 @@ def post_change(folder: RunFolder, assignments: Sequence[str]) -> int:
         RunFailedError: If the run does not take the change in time.
     """
     try:
-        address = json.loads(folder.live.read_text())["mailbox"]
-        mailbox = Mailbox.open(address)
-    except (OSError, ValueError, KeyError):
+        mailbox = Mailbox.open(folder.read_live())
+    except (OSError, ValueError):
         raise ConfigError(
             f"{folder.path}: no run in progress; give the folder of one that is"
         ) from None
