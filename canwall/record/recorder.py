@@ -28,12 +28,12 @@ class Recorder:
     def __init__(self) -> None:
         """Start the writer. Raises RecordError."""
         self.folder = Path()
-        self.ring = Ring.create()
         self._begun = False
         self._failure = ""
         self._unread = b""
         self._answers: list[str] = []
         try:
+            self.ring = Ring.create()
             self._writer = subprocess.Popen(
                 [sys.executable, "-P", "-m", "canwall.record.writer", str(self.ring.descriptor)],
                 stdin=subprocess.PIPE,

@@ -24,7 +24,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from canwall.errors import ConfigError
-from canwall.record.columns import record_batch, schema
+from canwall.record.columns import ROW, record_batch, schema
 from canwall.record.folder import (
     RecordError,
     RunFolder,
@@ -57,7 +57,9 @@ class _SignalsFile:
         self._stream_path = stream_of(path)
         self._file = self._stream_path.open("xb")
         self._stream = pa.ipc.new_stream(self._file, self._schema)
-        self._waiting: list[NDArray[np.void]] = []
+        # Without rows it is a record already.
+        self._waiting: list[NDArray[np.void]] = [np.zeros(0, ROW)]
+        self.synchronise()
 
     def add(self, rows: NDArray[np.void]) -> None:
         self._waiting.append(rows)

@@ -15,7 +15,8 @@ from pydantic import ValidationError
 from canwall.config import ConfigError, Settings, WallChange, absolute_law, first_error, load
 from canwall.cycle import WallAxis, run_laws
 from canwall.errors import RunFailedError
-from canwall.record import Mailbox, RunFolder
+from canwall.record import Mailbox, RecordError, RunFolder
+from canwall.record.folder import reason
 from canwall.walls import UnknownLawError, find_law
 
 #: Longest wait for the loop to take a change; it takes one at a time [s].
@@ -24,10 +25,16 @@ _PATIENCE_S = 5.0
 
 @contextmanager
 def open_to_changes(axes: Sequence[WallAxis], folders: Sequence[RunFolder]) -> Iterator[None]:
-    """Accept changes of the walls from other processes for as long as the context lasts."""
+    """Accept changes of the walls from other processes for as long as the context lasts.
+
+    Raises RecordError if live.json, or its shared memory, cannot be written.
+    """
     with ExitStack() as stack:
         for axis, folder in zip(axes, folders, strict=True):
-            axis.mailbox = Mailbox.create()
+            try:
+                axis.mailbox = Mailbox.create()
+            except OSError as error:
+                raise RecordError(f"no shared memory for changes: {reason(error)}") from None
             stack.callback(axis.mailbox.close)
             folder.write_live(axis.mailbox.address)
             stack.callback(folder.live.unlink, missing_ok=True)

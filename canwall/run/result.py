@@ -50,6 +50,7 @@ def write_result(
     Raises RecordError or RunFailedError if nothing was recorded.
     """
     settings = axis.settings
+    notes = [note for note in notes if note not in outcome.trips]  # each is told once
     signals = _read_recorded(folder, [*outcome.trips, *notes])
     summary = judged(signals, settings, axis.setup.units)
     summary |= {
@@ -71,14 +72,12 @@ def write_result(
             **(_real_time_summary(axis, exchange) if settings.real_time else {}),
         },
     }
-    # A trip is told by its text; a disk that is full must not keep it from being told.
-    notes = [note for note in notes if note not in outcome.trips]
     try:
         folder.write_summary(summary)
         if outcome.trip_cycle is not None:
             folder.write_trip(signals, outcome.trip_cycle)
     except RecordError as error:
-        notes.append(str(error))
+        notes.append(str(error))  # the trip is told nevertheless
     return RunResult(folder, summary, outcome, notes, remarks)
 
 

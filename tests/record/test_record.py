@@ -371,7 +371,7 @@ def test_nothing_is_written_through_a_symbolic_link(tmp_path: Path, name: str) -
 
 def test_bus_log_of_several_drives_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "bus.log").write_text("a thesis")
-    with pytest.raises(ConfigError, match="holds bus.log already"):
+    with pytest.raises(ConfigError, match=r"holds bus\.log already"):
         RunFolder.create(tmp_path / "node5", CONFIG, "../bus.log")
 
 
