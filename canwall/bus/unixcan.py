@@ -17,12 +17,14 @@ import logging
 import os
 import select
 import socket
+import stat
 import struct
 import threading
 import time
 import weakref
 from collections import deque
 from pathlib import Path
+from typing import BinaryIO
 
 import can
 from can.typechecking import AutoDetectedConfig, CanFilters, Channel
@@ -43,6 +45,8 @@ _REFUSALS = {
     errno.EACCES: "no permission; choose a path in a directory that you can write to",
     errno.EAGAIN: "its hub does not answer; end the process that holds its .lock file",
     errno.ENAMETOOLONG: f"longer than the {_SUN_PATH_MAX} bytes of a socket's path; shorten it",
+    errno.ELOOP: "its .lock file is a symbolic link; remove it, or choose another path",
+    errno.EISDIR: "its .lock is not a regular file; remove it, or choose another path",
     errno.ENOTSOCK: "a file that is not a socket is there; move it, or choose another path",
 }
 
@@ -108,6 +112,16 @@ def _refuse_other_files(path: Path) -> None:
 def _remove_socket(path: Path) -> None:
     _refuse_other_files(path)
     path.unlink(missing_ok=True)
+
+
+def _open_lock(path: str) -> BinaryIO:
+    """Open or create the lock file: never through a symbolic link, and leave its content alone."""
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK
+    lock = os.fdopen(os.open(path, flags, 0o666), "rb", buffering=0)
+    if not stat.S_ISREG(os.fstat(lock.fileno()).st_mode):
+        lock.close()
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    return lock
 
 
 class _Inbox:
@@ -208,7 +222,7 @@ class _Hub:
         self._sockets = select.epoll()
         _refuse_other_files(self._path)  # before a lock file lies beside it
         with contextlib.ExitStack() as undo:
-            self._lock = undo.enter_context(open(f"{channel}.lock", "wb"))
+            self._lock = undo.enter_context(_open_lock(f"{channel}.lock"))
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             _remove_socket(self._path)
             self._listener = undo.enter_context(

@@ -1,6 +1,7 @@
 """Construction and execution of a program of commands: `canwall`, or one of its groups."""
 
 import gc
+import os
 import sys
 from typing import Any, NoReturn
 
@@ -23,6 +24,7 @@ def make_program(**settings: Any) -> typer.Typer:
 
 def run_program(program: typer.Typer) -> NoReturn:
     """Run the program with the arguments of the process and exit with its exit code."""
+    _occupy_standard_streams()
     announce_compiling(
         lambda: say("compiling for this machine, about half a minute; later starts have it on disk")
     )
@@ -31,3 +33,14 @@ def run_program(program: typer.Typer) -> NoReturn:
     # command may take; all of it goes with the process.
     gc.freeze()
     sys.exit(code)
+
+
+def _occupy_standard_streams() -> None:
+    """Put /dev/null in place of the standard streams with which the process was not started.
+
+    A socket or a file that took such a number would get what is printed, and a process that is
+    started with pipes in these places would lose it.
+    """
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(descriptor, True)
+    os.close(descriptor)

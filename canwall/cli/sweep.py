@@ -8,7 +8,7 @@ import typer
 
 from canwall.cli.ending import StoppedError
 from canwall.cli.options import ConfigArgument, settings_from
-from canwall.cli.output import ProgressDisplay, console
+from canwall.cli.output import ProgressDisplay, console, say
 from canwall.errors import InputError, RunFailedError
 
 
@@ -143,7 +143,10 @@ def plot(
         Path, typer.Argument(metavar="DIR|FILE.nc", help="Folder of a run, or result of a sweep.")
     ],
 ) -> int:
-    """Draw the picture of a recorded run again, or the figures of a sweep."""
+    """Draw the picture of a recorded run again, or the figures of a sweep.
+
+    The folder of a run that did not end by itself is completed from its rows first.
+    """
     if what.suffix == ".nc":
         from canwall.sweep import read_sweep
         from canwall.sweep.figures import write_sweep_figures
@@ -152,7 +155,13 @@ def plot(
             console.print(str(picture), soft_wrap=True, highlight=False)
         return 0
     from canwall.record import RunFolder
-    from canwall.record.pictures import plot_run
+    from canwall.record.pictures import DRAWN, draw_run
+    from canwall.run import read_run
 
-    console.print(str(plot_run(RunFolder(what))), soft_wrap=True, highlight=False)
+    folder = RunFolder(what)
+    recorded = read_run(folder, DRAWN)
+    if recorded.remark:
+        say(recorded.remark)
+    picture = draw_run(folder.picture, recorded.signals, recorded.summary["strikes"])
+    console.print(str(picture), soft_wrap=True, highlight=False)
     return 0

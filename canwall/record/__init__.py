@@ -5,9 +5,9 @@ The cycle writes into a ring in shared memory and never waits for a disk. A sepa
 """
 
 from canwall.record.columns import ROW, TIMING_COLUMNS, Phase, column_table
-from canwall.record.folder import RunFolder, numbers, read_signals
+from canwall.record.folder import RecordError, RunFolder, numbers, read_signals
 from canwall.record.mailbox import Mailbox
-from canwall.record.recorder import Recorder, RecordError, start_recorders
+from canwall.record.recorder import Recorder, start_recorders
 from canwall.record.ring import FRAME, Ring
 
 __all__ = [

@@ -1,23 +1,76 @@
 """Folder of a run: names of its files, and functions to read them."""
 
 import contextlib
+import fcntl
 import json
-from collections.abc import Collection
+import os
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from canwall.errors import ConfigError
+from canwall.errors import ConfigError, RunFailedError
+from canwall.record.columns import schema
+from canwall.record.mailbox import MailboxAddress
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 #: Cycles before a trip that are kept.
 _TRIP_CYCLES = 200
+#: What readers of a summary need of each strike.
+_STRIKE = {
+    "start_s": float,
+    "end_s": float,
+    "law": str,
+    "stiffness": float,
+    "chatter": bool,
+    "chatter_frequency_hz": float,
+}
+
+
+class RecordError(RunFailedError):
+    """Failure to write a record."""
+
+
+def reason(error: BaseException) -> str:
+    """Return why a file could not be read or written, in one line."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+@contextlib.contextmanager
+def whole_file(path: Path) -> Iterator[IO[bytes]]:
+    """Write a file whole or not at all.
+
+    What has its name is replaced, and nothing written through it if it is a symbolic link.
+
+    Raises RecordError if it cannot be written.
+    """
+    new = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        new.unlink(missing_ok=True)
+        with new.open("xb") as file:
+            yield file
+            synchronise(file)
+        new.replace(path)
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            new.unlink(missing_ok=True)
+        if not isinstance(error, OSError):
+            raise
+        raise RecordError(f"{path}: cannot be written: {reason(error)}") from None
+
+
+def synchronise(file: IO[Any]) -> None:
+    """Write a file through to the disk."""
+    file.flush()
+    os.fsync(file.fileno())
 
 
 def stream_of(signals: Path) -> Path:
@@ -35,22 +88,30 @@ def read_signals(path: Path, columns: Collection[str] = ("j",)) -> "pa.Table":
         ConfigError: If the file is missing, not readable, or lacks one of `columns`.
     """
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
     try:
-        stream = stream_of(path)
-        table = _read_stream(stream) if stream.exists() else pq.ParquetFile(path).read()
+        try:
+            table = _read_stream(stream_of(path))
+        except FileNotFoundError:
+            table = _read_parquet(path)
+        table.validate(full=True)
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; give the folder of a run") from None
-    except (OSError, pa.ArrowInvalid) as error:
-        reason = str(error).splitlines()[0]
-        raise ConfigError(f"{path}: not a record of a run: {reason}") from None
+    except (OSError, pa.ArrowException) as error:
+        raise ConfigError(f"{path}: not a record of a run: {reason(error)}") from None
     missing = [name for name in columns if name not in table.column_names]
     if missing:
         raise ConfigError(
             f"{path}: lacks column {', '.join(missing)}: not a record of a run, or an older one "
             "than this needs"
         )
+    for field in schema(()):
+        if field.name in table.column_names and table.schema.field(field.name).type != field.type:
+            found = table.schema.field(field.name).type
+            raise ConfigError(
+                f"{path}: column {field.name} holds {found}, not {field.type}: not a record of a "
+                "run, or one of another version"
+            )
     return table
 
 
@@ -63,13 +124,20 @@ def numbers(signals: "pa.Table", name: str) -> NDArray[Any]:
     return np.concatenate(chunks) if chunks else np.empty(0)
 
 
+def _read_parquet(path: Path) -> "pa.Table":
+    import pyarrow.parquet as pq
+
+    with pq.ParquetFile(path, page_checksum_verification=True) as file:
+        return file.read()
+
+
 def _read_stream(path: Path) -> "pa.Table":
     """Return the batches of a stream up to the first incomplete one."""
     import pyarrow as pa
 
     with path.open("rb") as file, pa.ipc.open_stream(file) as stream:
         batches = []
-        with contextlib.suppress(OSError, pa.ArrowInvalid):
+        with contextlib.suppress(OSError, pa.ArrowException):
             batches.extend(stream)
         return pa.Table.from_batches(batches, stream.schema)
 
@@ -81,25 +149,66 @@ class RunFolder:
     path: Path
 
     @classmethod
-    def create(cls, path: Path | None) -> "RunFolder":
-        """Create a folder, by default `runs/<date and time>` under the current directory.
+    def create(cls, path: Path | None, config: str, bus_log: str = "bus.log") -> "RunFolder":
+        """Create the folder of one run, by default `runs/<date and time>` here.
 
-        Raises ConfigError if the folder cannot be created or already holds a run.
+        Args:
+            path: The folder; it may exist and hold other files.
+            config: Content of config.toml. Who creates that file has the folder.
+            bus_log: Path of the bus log, relative to the folder.
+
+        Raises:
+            ConfigError: If the folder cannot be written, or one of the files is there already,
+                whoever made it.
         """
-        path = path or cls.default_path()
-        folder = cls(path)
-        if folder.signals.exists() or stream_of(folder.signals).exists():
-            raise ConfigError(f"{path}: holds a run already; choose another --output")
+        folder = cls(path or cls.default_path())
         try:
-            path.mkdir(parents=True, exist_ok=True)
-            probe = path / ".writable"
-            probe.touch()
-            probe.unlink()
+            folder.path.mkdir(parents=True, exist_ok=True)
+            for file in folder._files(bus_log):
+                if os.path.lexists(file):
+                    raise _taken(file)
+            folder._claim(config)
         except OSError as error:
             raise ConfigError(
-                f"{path}: cannot be written: {error.strerror}; choose another --output"
+                f"{folder.path}: cannot be written: {reason(error)}; choose another --output"
             ) from None
         return folder
+
+    def _claim(self, config: str) -> None:
+        """Write config.toml, unless another run has done so meanwhile."""
+        try:
+            file = self.config.open("xb")
+        except FileExistsError:
+            raise _taken(self.config) from None
+        try:
+            with file:
+                file.write(config.encode())
+                synchronise(file)
+        except OSError:
+            self.config.unlink()
+            raise
+
+    def _files(self, bus_log: str) -> list[Path]:
+        signals, log = self.signals, self.path / bus_log
+        known = [signals, stream_of(signals), self.summary, self.picture, self.live, self.trip]
+        return [*known, self.config, log]
+
+    @property
+    def is_being_written(self) -> bool:
+        """True while a run, or what completes its record, is alive (`lock_folder`)."""
+        try:
+            descriptor = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
+        except OSError:
+            return False
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        except OSError:
+            return False  # a file system without locks
+        finally:
+            os.close(descriptor)
+        return False
 
     @staticmethod
     def default_path() -> Path:
@@ -136,21 +245,71 @@ class RunFolder:
         """Path of the last cycles before a trip, with every column, for a spreadsheet."""
         return self.path / "trip.csv"
 
+    def write_summary(self, summary: dict[str, Any]) -> None:
+        """Write summary.json. Raises RecordError if it cannot be written."""
+        with whole_file(self.summary) as file:
+            file.write(json.dumps(summary, indent=2).encode() + b"\n")
+
     def write_trip(self, signals: "pa.Table", cycle: int) -> None:
-        """Write the cycles up to the one that tripped, in the order of j."""
+        """Write the cycles up to the one that tripped, in the order of j.
+
+        Raises RecordError if they cannot be written.
+        """
         import pyarrow.csv as pa_csv
 
         end = int(np.searchsorted(numbers(signals, "j"), cycle, side="right"))
-        pa_csv.write_csv(
-            signals.slice(max(0, end - _TRIP_CYCLES), min(end, _TRIP_CYCLES)), self.trip
-        )
+        rows = signals.slice(max(0, end - _TRIP_CYCLES), min(end, _TRIP_CYCLES))
+        with whole_file(self.trip) as file:
+            pa_csv.write_csv(rows, file)
+
+    def write_live(self, address: MailboxAddress) -> None:
+        """Write live.json. Raises RecordError if it cannot be written."""
+        with whole_file(self.live) as file:
+            file.write(json.dumps(address._asdict()).encode())
+
+    def read_live(self) -> MailboxAddress:
+        """Read live.json. Raises OSError or ValueError if there is none that can be used."""
+        try:
+            content = json.loads(self.live.read_text(encoding="utf-8"))
+        except RecursionError:
+            content = None
+        kinds = MailboxAddress.__annotations__
+        if not isinstance(content, dict) or {k: type(v) for k, v in content.items()} != kinds:
+            raise ValueError("not the address of a mailbox")
+        return MailboxAddress(**content)
 
     def read_summary(self) -> dict[str, Any]:
-        """Read summary.json. Raises ConfigError if it is missing or not JSON."""
+        """Read summary.json. Raises ConfigError if it is missing or not a summary."""
         try:
-            content: dict[str, Any] = json.loads(self.summary.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise ConfigError(f"{self.summary}: not a summary of a run: {error}") from None
-        if "strikes" not in content:
+            content = json.loads(self.summary.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError) as error:
+            raise ConfigError(f"{self.summary}: not a summary of a run: {reason(error)}") from None
+        strikes = content.get("strikes") if isinstance(content, dict) else None
+        if not isinstance(strikes, list) or not all(map(_is_strike, strikes)):
             raise ConfigError(f"{self.summary}: not a summary of a run: lacks strikes")
         return content
+
+
+def _is_strike(entry: object) -> bool:
+    return isinstance(entry, dict) and all(
+        isinstance(entry.get(name), (int, float) if kind is float else kind)
+        for name, kind in _STRIKE.items()
+    )
+
+
+def lock_folder(path: Path) -> int | None:
+    """Mark a run's folder as being written for as long as the descriptor is open.
+
+    Returns None where the file system has no locks.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        return None
+    return descriptor
+
+
+def _taken(file: Path) -> ConfigError:
+    return ConfigError(f"{file.parent}: holds {file.name} already; choose another --output")

@@ -4,10 +4,13 @@ A change is a text. The run that owns the mailbox answers it with the cycle from
 force, or with the reason why it is not; the sender waits for that.
 """
 
+import errno
 import fcntl
 import mmap
 import os
+import secrets
 import time
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,6 +29,15 @@ _POLL_S = 0.001
 _REFUSED = -1
 #: Time for an answer that crosses with a withdrawal [s].
 _LAST_ANSWER_S = 1.0
+_NAME = "canwall-mailbox-"
+
+
+class MailboxAddress(NamedTuple):
+    """Address of a mailbox: a descriptor of a process, and the file that it has to be."""
+
+    pid: int
+    descriptor: int
+    file: str
 
 
 class Mailbox:
@@ -40,20 +52,28 @@ class Mailbox:
 
     @classmethod
     def create(cls) -> "Mailbox":
-        """Create an empty mailbox."""
-        descriptor = os.memfd_create("canwall-mailbox")
+        """Create an empty mailbox, with a name that no other has."""
+        descriptor = os.memfd_create(f"{_NAME}{secrets.token_hex(16)}")
         os.ftruncate(descriptor, _SIZE)
         return cls(descriptor)
 
     @classmethod
-    def open(cls, address: str) -> "Mailbox":
+    def open(cls, address: "MailboxAddress") -> "Mailbox":
         """Open the mailbox of another process. Raises OSError if it no longer exists."""
-        return cls(os.open(address, os.O_RDWR))
+        path = f"/proc/{address.pid}/fd/{address.descriptor}"
+        # The process may have ended, and its number be that of another one, with other files.
+        if os.readlink(path) == address.file and address.file.startswith(f"/memfd:{_NAME}"):
+            descriptor = os.open(path, os.O_RDWR | os.O_NONBLOCK)
+            if os.readlink(f"/proc/self/fd/{descriptor}") == address.file:
+                return cls(descriptor)
+            os.close(descriptor)
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), path)
 
     @property
-    def address(self) -> str:
+    def address(self) -> "MailboxAddress":
         """Address by which other processes on this machine open it while this process lives."""
-        return f"/proc/{os.getpid()}/fd/{self._descriptor}"
+        file = os.readlink(f"/proc/self/fd/{self._descriptor}")
+        return MailboxAddress(os.getpid(), self._descriptor, file)
 
     def close(self) -> None:
         """Close the mailbox in this process."""

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from canwall.figure_style import COLOURS, STYLE
-from canwall.record.folder import RunFolder, numbers, read_signals
+from canwall.record.folder import RunFolder, numbers, read_signals, whole_file
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 #: Length of a close-up [s].
 _CLOSE_UP_S = 0.045
 #: Columns of the record that the picture needs.
-_DRAWN = ("t_s", "y", "torque_applied", "force_applied")
+DRAWN = ("t_s", "y", "torque_applied", "force_applied")
 #: Fixed title positions: no title here has to avoid ticks, and looking for them takes time.
 _QUICK = {"axes.titley": 1.0}
 
@@ -29,14 +29,23 @@ _QUICK = {"axes.titley": 1.0}
 def plot_run(folder: RunFolder) -> Path:
     """Draw the run into run.png and return its path.
 
+    Raises:
+        ConfigError: If the folder holds no record.
+        RecordError: If run.png cannot be written.
+    """
+    signals, summary = read_signals(folder.signals, DRAWN), folder.read_summary()
+    return draw_run(folder.picture, signals, summary["strikes"])
+
+
+def draw_run(picture: Path, signals: "pa.Table", strikes: list[dict[str, Any]]) -> Path:
+    """Draw a run into a PNG file and return its path.
+
     The picture shows position and torque over time with the strikes marked, a close-up of one
     contact of each law (Figure 5.19 of the source), and force over position (Figure 5.3).
 
     Raises:
-        ConfigError: If the folder holds no record.
+        RecordError: If the file cannot be written.
     """
-    signals, summary = read_signals(folder.signals, _DRAWN), folder.read_summary()
-    strikes = summary["strikes"]
     laws = list(dict.fromkeys(strike["law"] for strike in strikes))
     colours = dict(zip(laws, COLOURS * 4, strict=False))
     shown = [next(s for s in strikes if s["law"] == law) for law in laws[:2]]
@@ -54,8 +63,9 @@ def plot_run(folder: RunFolder) -> Path:
         # Figure.savefig would draw everything twice, first only for the layout.
         canvas = FigureCanvasAgg(figure)
         quick = {"compress_level": 1}
-        canvas.print_png(folder.picture, pil_kwargs=quick)  # type: ignore[no-untyped-call]
-    return folder.picture
+        with whole_file(picture) as file:
+            canvas.print_png(file, pil_kwargs=quick)  # type: ignore[no-untyped-call]
+    return picture
 
 
 def _mark_strikes(axes: Axes, strikes: list[dict[str, Any]], colours: dict[str, str]) -> None:

@@ -11,15 +11,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from canwall.errors import RunFailedError
+from canwall.record.folder import RecordError
 from canwall.record.ring import Ring
 
 #: Time limit for the writer to complete its files after the run, or to draw [s].
 _TIMEOUT_S = 60.0
-
-
-class RecordError(RunFailedError):
-    """Failure to write a record."""
 
 
 class Recorder:
@@ -32,9 +28,12 @@ class Recorder:
     def __init__(self) -> None:
         """Start the writer. Raises RecordError."""
         self.folder = Path()
-        self.ring = Ring.create()
         self._begun = False
+        self._failure = ""
+        self._unread = b""
+        self._answers: list[str] = []
         try:
+            self.ring = Ring.create()
             self._writer = subprocess.Popen(
                 [sys.executable, "-P", "-m", "canwall.record.writer", str(self.ring.descriptor)],
                 stdin=subprocess.PIPE,
@@ -45,6 +44,9 @@ class Recorder:
             )
         except OSError as error:
             raise RecordError(f"the writer of the record does not start: {error}") from None
+        assert self._writer.stdout is not None
+        self._says = select.poll()
+        self._says.register(self._writer.stdout, select.POLLIN)
 
     def __enter__(self) -> "Recorder":
         return self
@@ -62,12 +64,22 @@ class Recorder:
         self._begun = True
         self._tell(folder=str(folder), bus_log=bus_log, channel=channel, laws=list(laws))
 
+    def failure(self) -> str:
+        """Return why the record cannot go on, in a line, as soon as it is so; empty while it does.
+
+        It takes a microsecond, so that the loop can ask in every cycle.
+        """
+        if not self._failure and self._says.poll(0):
+            self._listen()
+        return self._failure and f"{self.folder}: the record is incomplete: {self._failure}"
+
     def close(self) -> list[str]:
         """Complete the files. Returns remarks for readers of the record, one line each."""
         self._tell(close=True)
-        error = self._answer()
+        if error := self._answer():
+            self._failure = self._failure or error
+        notes = [failure] if (failure := self.failure()) else []
         header = self.ring.header[0]
-        notes = [f"{self.folder}: the record is incomplete: {error}"] if error else []
         for what in ("rows", "frames"):
             lost = int(header[f"{what}_lost"])
             if lost:
@@ -82,23 +94,35 @@ class Recorder:
 
     def _tell(self, **order: Any) -> None:
         assert self._writer.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # `_answer` notices a writer that has died
+        with contextlib.suppress(BrokenPipeError):  # `_listen` notices a writer that has died
             self._writer.stdin.write(json.dumps(order).encode() + b"\n")
 
     def _answer(self) -> str:
-        """Return the writer's error message, empty if all went well."""
-        assert self._writer.stdout is not None
-        line, deadline = b"", time.monotonic() + _TIMEOUT_S
-        while not line.endswith(b"\n"):
+        """Return the writer's error message on an order, empty if all went well."""
+        deadline = time.monotonic() + _TIMEOUT_S
+        while not self._answers:
             wait_s = max(0.0, deadline - time.monotonic())
-            readable, _, _ = select.select([self._writer.stdout], [], [], wait_s)
-            part = os.read(self._writer.stdout.fileno(), 4096) if readable else b""
-            if not part:
+            if not self._says.poll(wait_s * 1e3):
                 self._writer.kill()
-                return "the writer of the record did not finish"
-            line += part
-        error: str = json.loads(line)["error"]
-        return error
+                return "the writer of the record does not answer"
+            if not self._listen():
+                return self._failure
+        return self._answers.pop(0)
+
+    def _listen(self) -> bool:
+        """Read what the writer says, which is waiting; return False if it has died."""
+        assert self._writer.stdout is not None
+        part = os.read(self._writer.stdout.fileno(), 4096)
+        *lines, self._unread = (self._unread + part).split(b"\n")
+        for line in lines:
+            said = json.loads(line)
+            if "done" in said:
+                self._answers.append(said["done"])
+            else:
+                self._failure = said["failed"]
+        if not part:
+            self._failure = self._failure or "the writer of the record has died"
+        return bool(part)
 
 
 @contextlib.contextmanager

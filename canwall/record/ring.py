@@ -5,6 +5,7 @@ counter: the head counts the items put in (`append`), the tail the items taken o
 reset.
 """
 
+import fcntl
 import mmap
 import os
 
@@ -63,7 +64,10 @@ class Ring:
     @classmethod
     def create(cls) -> "Ring":
         """Create an empty ring."""
-        descriptor = os.memfd_create("canwall-record")
+        memory = os.memfd_create("canwall-record")
+        # The writer has standard streams in place of whatever was closed here.
+        descriptor = fcntl.fcntl(memory, fcntl.F_DUPFD_CLOEXEC, 3)
+        os.close(memory)
         os.ftruncate(descriptor, cls.size())
         return cls(descriptor)
 

@@ -1,9 +1,9 @@
 """Process that empties the ring into the run's folder: `python -m canwall.record.writer`.
 
 It takes orders from standard input (sent by `recorder.Recorder`) and answers on standard output,
-one line of JSON each. When the master closes its end of the pipe, or dies, the writer completes
-the files and ends. It also draws the picture, since it can load the plotting library while the
-master sets up the drive.
+one line of JSON each; if the record cannot go on, it says so at once. When the master closes its
+end of the pipe, or dies, the writer completes the files and ends. It also draws the picture, since
+it can load the plotting library while the master sets up the drive.
 """
 
 import contextlib
@@ -24,8 +24,16 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from canwall.errors import ConfigError
-from canwall.record.columns import record_batch, schema
-from canwall.record.folder import RunFolder, stream_of
+from canwall.record.columns import ROW, record_batch, schema
+from canwall.record.folder import (
+    RecordError,
+    RunFolder,
+    lock_folder,
+    reason,
+    stream_of,
+    synchronise,
+    whole_file,
+)
 from canwall.record.pictures import plot_run
 from canwall.record.ring import Ring, to_message
 
@@ -47,9 +55,11 @@ class _SignalsFile:
         self._schema = schema(laws)
         self._path = path
         self._stream_path = stream_of(path)
-        self._file = self._stream_path.open("wb")
+        self._file = self._stream_path.open("xb")
         self._stream = pa.ipc.new_stream(self._file, self._schema)
-        self._waiting: list[NDArray[np.void]] = []
+        # Without rows it is a record already.
+        self._waiting: list[NDArray[np.void]] = [np.zeros(0, ROW)]
+        self.synchronise()
 
     def add(self, rows: NDArray[np.void]) -> None:
         self._waiting.append(rows)
@@ -60,7 +70,7 @@ class _SignalsFile:
             rows = np.concatenate(self._waiting)
             self._waiting = []
             self._stream.write_batch(record_batch(rows, self._laws))
-        _synchronise(self._file)
+        synchronise(self._file)
 
     def close(self) -> None:
         self.synchronise()
@@ -68,7 +78,8 @@ class _SignalsFile:
         self._file.close()
         with (
             pa.ipc.open_stream(self._stream_path) as rows,
-            pq.ParquetWriter(self._path, self._schema) as file,
+            whole_file(self._path) as parquet,
+            pq.ParquetWriter(parquet, self._schema, write_page_checksum=True) as file,
         ):
             group: list[pa.RecordBatch] = []
             for batch in rows:
@@ -81,17 +92,15 @@ class _SignalsFile:
         self._stream_path.unlink()
 
 
-def _synchronise(file: IO[Any]) -> None:
-    file.flush()
-    os.fsync(file.fileno())
-
-
 class _BusLog:
     """Frames in one of python-can's formats; discarded without a path."""
 
     def __init__(self, path: Path | None, channel: str) -> None:
         self._channel = channel
-        self._log = None if path is None else can.Logger(str(path))
+        self._log = None
+        if path is not None:
+            path.open("xb").close()
+            self._log = can.Logger(str(path))
 
     def add(self, frames: NDArray[np.void]) -> None:
         if self._log is not None:
@@ -102,7 +111,7 @@ class _BusLog:
         # The database writer has no file object, and commits on its own schedule.
         file = getattr(self._log, "file", None)
         if file is not None:
-            _synchronise(file)
+            synchronise(file)
 
     def close(self) -> None:
         if self._log is not None:
@@ -113,6 +122,7 @@ def write(
     ring: Ring, orders: IO[bytes], folder: Path, bus_log: str, channel: str, laws: list[str]
 ) -> None:
     """Empty the ring into the folder until an order comes or the master is gone."""
+    lock_folder(folder)  # for as long as this process lives
     signals = _SignalsFile(folder / "signals.parquet", laws)
     log = _BusLog(folder / bus_log if bus_log else None, channel)
 
@@ -133,41 +143,42 @@ def write(
             log.synchronise()
             synchronised = time.monotonic()
     drain()
-    signals.close()
-    log.close()
+    try:
+        signals.close()
+    finally:
+        log.close()
 
 
 def _is_ordered(orders: IO[bytes], timeout_s: float) -> bool:
     return bool(select.select([orders], [], [], timeout_s)[0])
 
 
-def _record(ring: Ring, orders: IO[bytes], order: dict[str, Any]) -> str:
-    """Write the record that the order describes; return an error message or an empty text."""
+def _record(ring: Ring, orders: IO[bytes], order: dict[str, Any]) -> None:
+    """Write the record that the order describes; say so at once if that fails."""
     try:
         write(
             ring, orders, Path(order["folder"]), order["bus_log"], order["channel"], order["laws"]
         )
-    except (OSError, pa.ArrowException, sqlite3.Error) as failure:
+    except (OSError, RecordError, pa.ArrowException, sqlite3.Error) as failure:
+        _say(failed=reason(failure))
         # Keep emptying the ring, so that it does not fill up and disturb the master.
         while not _is_ordered(orders, _POLL_S):
             ring.take_frames()
             ring.take_rows()
-        return str(failure)
-    return ""
 
 
 def _draw(folder: Path) -> str:
     """Draw the run's picture; return an error message or an empty text."""
     try:
         plot_run(RunFolder(folder))
-    except (OSError, ConfigError) as failure:
-        return str(failure)
+    except (OSError, ConfigError, RecordError) as failure:
+        return reason(failure)
     return ""
 
 
-def _answer(error: str) -> None:
+def _say(**what: str) -> None:
     with contextlib.suppress(BrokenPipeError):
-        os.write(sys.stdout.fileno(), json.dumps({"error": error}).encode() + b"\n")
+        os.write(sys.stdout.fileno(), json.dumps(what).encode() + b"\n")
 
 
 def main() -> None:
@@ -177,11 +188,11 @@ def main() -> None:
     with open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as orders:
         if begin := orders.readline():
             order = json.loads(begin)
-            error = _record(ring, orders, order)
+            _record(ring, orders, order)
             if orders.readline():
-                _answer(error)
+                _say(done="")
             while orders.readline():
-                _answer(_draw(Path(order["folder"])))
+                _say(done=_draw(Path(order["folder"])))
     gc.freeze()  # the master waits for the exit: spare it a collection of all imported modules
 
 

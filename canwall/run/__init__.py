@@ -1,7 +1,8 @@
 """A run from configuration to folder.
 
 `buses` opens the bus, `assembly` builds axes and exchange, `running` executes the run, `result`
-summarises it, `changes` accepts changes of the wall, `stopping` handles the signals that end it.
+summarises it, `recorded` reads one back, `changes` accepts changes of the wall, `stopping` handles
+the signals that end it.
 `closed_loop` simulates a run in memory, `referent` the continuous wall that it is compared with.
 """
 
@@ -15,11 +16,13 @@ from canwall.run.assembly import (
     restoring_drives,
 )
 from canwall.run.buses import make_simulated_drive, on_the_bus, open_bus, serve_drive
+from canwall.run.recorded import RunRecord, read_run
 from canwall.run.result import RunResult
 from canwall.run.running import run, run_together
 from canwall.run.stopping import StopRequest, stop_on_signals
 
 __all__ = [
+    "RunRecord",
     "RunResult",
     "StopRequest",
     "drive_dictionary",
@@ -30,6 +33,7 @@ __all__ = [
     "on_the_bus",
     "open_bus",
     "prepared_machine",
+    "read_run",
     "render",
     "restoring_drives",
     "run",

@@ -5,7 +5,6 @@ against the wall that is in force, as a whole, and offers it to the loop, which 
 if that is still the wall in force. What fails is refused to the one who asked.
 """
 
-import json
 import threading
 import time
 import tomllib
@@ -20,7 +19,8 @@ from canwall.compiled import copied
 from canwall.config import ConfigError, Wall, WallChange, absolute_law, check_values, first_error
 from canwall.cycle import Offer, WallAxis, set_limits, set_wall
 from canwall.errors import RunFailedError
-from canwall.record import Mailbox, RunFolder
+from canwall.record import Mailbox, RecordError, RunFolder
+from canwall.record.folder import reason
 from canwall.walls import DEADBEAT, UnknownLawError, find_law
 
 #: Longest wait for the loop to take a change; it takes one at a time [s].
@@ -32,16 +32,22 @@ _ENDED = "the run has ended"
 
 @contextmanager
 def open_to_changes(axes: Sequence[WallAxis], folders: Sequence[RunFolder]) -> Iterator[None]:
-    """Accept changes of the walls from other processes for as long as the context lasts."""
+    """Accept changes of the walls from other processes for as long as the context lasts.
+
+    Raises RecordError if live.json, or its shared memory, cannot be written.
+    """
     ended = threading.Event()
     with ExitStack() as stack:
         for axis, folder in zip(axes, folders, strict=True):
-            mailbox = Mailbox.create()
+            try:
+                mailbox = Mailbox.create()
+            except OSError as error:
+                raise RecordError(f"no shared memory for changes: {reason(error)}") from None
             stack.callback(mailbox.close)
             judge = threading.Thread(target=_judge, args=(axis, mailbox, ended), daemon=True)
             judge.start()
             stack.callback(judge.join)
-            folder.live.write_text(json.dumps({"mailbox": mailbox.address}))
+            folder.write_live(mailbox.address)
             stack.callback(folder.live.unlink, missing_ok=True)
         stack.callback(ended.set)
         yield
@@ -137,9 +143,8 @@ def post_change(folder: RunFolder, assignments: Sequence[str]) -> int:
         RunFailedError: If the run does not take the change in time.
     """
     try:
-        address = json.loads(folder.live.read_text())["mailbox"]
-        mailbox = Mailbox.open(address)
-    except (OSError, ValueError, KeyError):
+        mailbox = Mailbox.open(folder.read_live())
+    except (OSError, ValueError):
         raise ConfigError(
             f"{folder.path}: no run in progress; give the folder of one that is"
         ) from None

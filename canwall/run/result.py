@@ -1,6 +1,5 @@
 """Result of a run: its summary and remarks."""
 
-import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +10,7 @@ from canwall.errors import RunFailedError
 from canwall.record import RecordError, RunFolder, numbers, read_signals
 from canwall.record.summary import summarise
 from canwall.run.referent import referent_positions
+from canwall.units import DriveUnits
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -50,11 +50,11 @@ def write_result(
     Raises RecordError or RunFailedError if nothing was recorded.
     """
     settings = axis.settings
+    notes = [note for note in notes if note not in outcome.trips]  # each is told once
     signals = _read_recorded(folder, [*outcome.trips, *notes])
-    wall = (numbers(signals, name) for name in ("stiffness", "damping", "wall_position_rad"))
-    referent = referent_positions(settings, *wall)
-    summary = summarise(signals, settings, axis.setup.units, referent)
+    summary = judged(signals, settings, axis.setup.units)
     summary |= {
+        "cut_off": False,
         "missed_tpdo": int(axis.cycle["missed_tpdo"][0]),
         "late_rpdo": axis.late_rpdo,
         "error_frames": monitor.error_frames,
@@ -72,10 +72,19 @@ def write_result(
             **(_real_time_summary(axis, exchange) if settings.real_time else {}),
         },
     }
-    folder.summary.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    if outcome.trip_cycle is not None:
-        folder.write_trip(signals, outcome.trip_cycle)
+    try:
+        folder.write_summary(summary)
+        if outcome.trip_cycle is not None:
+            folder.write_trip(signals, outcome.trip_cycle)
+    except RecordError as error:
+        notes.append(str(error))  # the trip is told nevertheless
     return RunResult(folder, summary, outcome, notes, remarks)
+
+
+def judged(signals: "pa.Table", settings: Settings, units: DriveUnits) -> dict[str, Any]:
+    """Return what the summary has from the rows, judged against the continuous referent."""
+    wall = (numbers(signals, name) for name in ("stiffness", "damping", "wall_position_rad"))
+    return summarise(signals, settings, units, referent_positions(settings, *wall))
 
 
 def _real_time_summary(axis: WallAxis, exchange: Exchange) -> dict[str, Any]:

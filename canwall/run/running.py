@@ -8,7 +8,7 @@ from contextlib import closing
 from pathlib import Path
 
 from canwall.config import ConfigError, Settings
-from canwall.cycle import run_laws
+from canwall.cycle import WallGivenUpError, run_laws
 from canwall.record import Recorder, RunFolder, start_recorders
 from canwall.run.assembly import (
     drive_dictionary,
@@ -73,12 +73,11 @@ def run_together(
     dictionaries = [drive_dictionary(settings) for settings in many]
     first = many[0]
     with on_the_bus(*many) as link:
-        folders = _run_folders(many, output)
-        notes: list[list[str]] = []
         # One log of the bus for all of them.
         log = first.run.bus_log if len(many) == 1 else f"../{first.run.bus_log}"
-        for settings, folder, known, recorder in zip(many, folders, laws, recorders, strict=True):
-            folder.config.write_text(settings.to_toml(), encoding="utf-8")
+        folders = _run_folders(many, output, log)
+        notes: list[list[str]] = []
+        for folder, known, recorder in zip(folders, laws, recorders, strict=True):
             bus_log = log if recorder is recorders[0] else ""
             names = [law.name for law in known]
             recorder.begin(folder.path, bus_log, first.bus.channel, names)
@@ -101,7 +100,7 @@ def run_together(
                 ):
                     outcome = render(
                         exchange,
-                        lambda: stop() or stopped(),
+                        lambda: _recorded(recorders) and (stop() or stopped()),
                         lambda now_s: progress(now_s, first.run.duration_s),
                     )
         finally:
@@ -135,8 +134,19 @@ def _check_together(many: Sequence[Settings]) -> None:
         raise ConfigError(f"drive.node_id: {nodes}: every drive needs one of its own")
 
 
-def _run_folders(many: Sequence[Settings], output: Path | None) -> list[RunFolder]:
+def _recorded(recorders: Sequence[Recorder]) -> bool:
+    """Return True while the run is recorded. Raises WallGivenUpError once it is not."""
+    for recorder in recorders:
+        if failure := recorder.failure():
+            raise WallGivenUpError(failure)
+    return True
+
+
+def _run_folders(many: Sequence[Settings], output: Path | None, bus_log: str) -> list[RunFolder]:
     if len(many) == 1:
-        return [RunFolder.create(output)]
+        return [RunFolder.create(output, many[0].to_toml(), bus_log)]
     base = output or RunFolder.default_path()
-    return [RunFolder.create(base / f"node{settings.drive.node_id}") for settings in many]
+    return [
+        RunFolder.create(base / f"node{settings.drive.node_id}", settings.to_toml(), bus_log)
+        for settings in many
+    ]

@@ -1,6 +1,17 @@
-"""Journal of a sweep on disk, from which an interrupted one can be resumed."""
+"""Journal of a sweep on disk, from which an interrupted one can be resumed.
 
-import sqlite3
+A text file: its first line names the plan by its SHA-256, each further one holds a finished piece:
+number, SHA-256 of plan, number and content, and the content in base64. A line that is not what was
+written is passed over, and its piece computed again.
+"""
+
+import base64
+import binascii
+import errno
+import fcntl
+import hashlib
+import os
+import stat
 from pathlib import Path
 
 import numpy as np
@@ -8,11 +19,13 @@ from numpy.typing import NDArray
 
 from canwall.errors import InputError
 
+_TITLE = b"canwall sweep journal"
+
 
 class Journal:
-    """A file next to the result with the plan and the finished pieces, removed at the end.
+    """A file next to the result with the finished pieces of a plan, removed at the end.
 
-    Each piece is a transaction: it survives however the process ends.
+    Each piece is on the disk when `put` returns: it survives however the process ends.
     """
 
     def __init__(self, output: Path, plan: str, resume: bool) -> None:
@@ -24,64 +37,145 @@ class Journal:
             resume: Continue from an existing journal.
 
         Raises:
-            InputError: If there is a result, a journal that is not to be resumed or of another
-                plan, or if the file cannot be written.
+            InputError: If there is a result, a journal that is not to be resumed, of another plan
+                or in use, or if the file cannot be written.
         """
-        if output.exists():
+        if os.path.lexists(output):
             raise InputError(f"{output}: exists already; choose another --output")
         self.path = output.with_name(output.name + ".partial")
-        if self.path.exists() and not resume:
-            raise InputError(
-                f"{self.path}: holds an unfinished sweep; --resume continues it, or remove it"
-            )
+        self._plan = hashlib.sha256(plan.encode()).digest()
+        #: Place and length of the line of each finished piece.
+        self._lines: dict[int, tuple[int, int]] = {}
         try:
-            self._database = sqlite3.connect(self.path, timeout=1.0, isolation_level=None)
-            self._database.execute("PRAGMA locking_mode = EXCLUSIVE")
-            self._database.execute("CREATE TABLE IF NOT EXISTS plan (text TEXT)")
-            self._database.execute(
-                "CREATE TABLE IF NOT EXISTS pieces (number INTEGER PRIMARY KEY, data BLOB)"
-            )
-            known = self._database.execute("SELECT text FROM plan").fetchone()
-            if known is None:
-                self._database.execute("INSERT INTO plan VALUES (?)", (plan,))
-        except sqlite3.OperationalError as error:
-            raise InputError(f"{self.path}: cannot be written: {error}") from None
-        except sqlite3.DatabaseError:
-            raise InputError(
-                f"{self.path}: holds no unfinished sweep; remove it, or choose another --output"
-            ) from None
-        if known is not None and known[0] != plan:
-            self._database.close()
+            self._file = self._open(resume)
+        except OSError as error:
+            raise self._unwritable(error) from None
+        try:
+            self._read_lines()
+        except OSError as error:
+            # An empty file would only stand in the way of the next attempt.
+            (self.close if os.fstat(self._file).st_size else self.remove)()
+            raise self._unwritable(error) from None
+        except InputError:
+            self.close()
+            raise
+
+    def _open(self, resume: bool) -> int:
+        """Open the file for this process alone; never through a symbolic link."""
+        flags = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        try:
+            file = os.open(self.path, flags | os.O_CREAT | os.O_EXCL, 0o666)
+        except FileExistsError:
+            if not resume:
+                raise InputError(
+                    f"{self.path}: holds an unfinished sweep; --resume continues it, or remove it"
+                ) from None
+            try:
+                file = os.open(self.path, flags)
+            except OSError as error:
+                if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
+                    raise self._foreign() from None
+                raise
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(file)
+            raise InputError(f"{self.path}: another sweep is writing it; let that end") from None
+        except OSError:
+            pass  # a file system without locks
+        return file
+
+    def _read_lines(self) -> None:
+        """Find the finished pieces, and cut off what follows the last whole line."""
+        if not stat.S_ISREG(os.fstat(self._file).st_mode):
+            raise self._foreign()
+        title = b"%s %s\n" % (_TITLE, self._plan.hex().encode())
+        found = os.pread(self._file, len(title), 0)
+        if found == title[: len(found)]:
+            # New, or cut off in its first line.
+            if len(found) < len(title):
+                os.ftruncate(self._file, 0)
+                self._append(title)
+        elif len(found) == len(title) and found.startswith(_TITLE) and found.endswith(b"\n"):
             raise InputError(
                 f"{self.path}: holds a sweep of another configuration or other axes; "
                 "choose another --output"
             )
+        else:
+            raise self._foreign()
+        with open(self._file, "rb", closefd=False) as lines:
+            end = lines.seek(len(title))
+            for line in lines:
+                if not line.endswith(b"\n"):
+                    break
+                if (piece := self._parse(line)) is not None:
+                    self._lines[piece[0]] = end, len(line)
+                end += len(line)
+        os.ftruncate(self._file, end)
 
     def done(self) -> list[int]:
         """Return the numbers of the finished pieces."""
-        return [number for (number,) in self._database.execute("SELECT number FROM pieces")]
+        return list(self._lines)
 
     def put(self, number: int, piece: NDArray[np.void]) -> None:
         """Store a piece. Raises InputError if it cannot be written."""
+        data = piece.tobytes()
+        digest = self._digest(number, data).encode()
+        line = b"%d %s %s\n" % (number, digest, base64.b64encode(data))
         try:
-            self._database.execute(
-                "INSERT OR REPLACE INTO pieces VALUES (?, ?)", (number, piece.tobytes())
-            )
-        except sqlite3.Error as error:
-            raise InputError(f"{self.path}: cannot be written: {error}") from None
+            self._lines[number] = self._append(line), len(line)
+        except OSError as error:
+            raise self._unwritable(error) from None
 
     def get(self, number: int, dtype: np.dtype[np.void]) -> NDArray[np.void]:
-        """Return a finished piece, shape (n,)."""
-        (data,) = self._database.execute(
-            "SELECT data FROM pieces WHERE number = ?", (number,)
-        ).fetchone()
-        return np.frombuffer(data, dtype)
+        """Return a finished piece, shape (n,). Raises InputError if it has been damaged."""
+        place, length = self._lines[number]
+        piece = self._parse(os.pread(self._file, length, place))
+        if piece is None or piece[0] != number or len(piece[1]) % dtype.itemsize:
+            raise InputError(f"{self.path}: piece {number} is damaged; --resume computes it again")
+        return np.frombuffer(piece[1], dtype)
 
     def close(self) -> None:
         """Close the file and keep it."""
-        self._database.close()
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
 
     def remove(self) -> None:
         """Close and delete the file."""
         self.close()
         self.path.unlink(missing_ok=True)
+
+    def _append(self, line: bytes) -> int:
+        """Write a line at the end, whole or not at all, and return its place."""
+        place = os.lseek(self._file, 0, os.SEEK_END)
+        try:
+            rest = memoryview(line)
+            while rest:
+                rest = rest[os.write(self._file, rest) :]
+            os.fsync(self._file)
+        except OSError:
+            os.ftruncate(self._file, place)
+            raise
+        return place
+
+    def _parse(self, line: bytes) -> tuple[int, bytes] | None:
+        """Return number and content of a line, None unless it is as it was written."""
+        try:
+            number, digest, content = line.removesuffix(b"\n").split(b" ")
+            data = base64.b64decode(content, validate=True)
+            piece = int(number), data
+        except (ValueError, binascii.Error):
+            return None
+        return piece if digest == self._digest(*piece).encode() else None
+
+    def _digest(self, number: int, data: bytes) -> str:
+        return hashlib.sha256(self._plan + b"%d " % number + data).hexdigest()
+
+    def _foreign(self) -> InputError:
+        return InputError(
+            f"{self.path}: holds no unfinished sweep; remove it, or choose another --output"
+        )
+
+    def _unwritable(self, error: OSError) -> InputError:
+        return InputError(f"{self.path}: cannot be written: {error.strerror}")

@@ -3,11 +3,19 @@
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures import (
+    BrokenExecutor,
+    Executor,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    as_completed,
+)
 
 from threadpoolctl import threadpool_limits
 
+from canwall.errors import RunFailedError
 from canwall.sweep.cluster import compute_on_cluster
 from canwall.sweep.plan import PieceResult, Plan, compute_piece
 
@@ -25,6 +33,7 @@ def compute_pieces(
 
     Raises:
         InputError: If there is no scheduler at the address.
+        RunFailedError: If the cluster fails, or a process dies.
     """
     if dask is not None:
         return compute_on_cluster(plan, pieces, dask)
@@ -37,9 +46,18 @@ def compute_pieces(
 
 
 def _init_process() -> None:
-    """Leave Ctrl-C to the parent process, and the cores to the pieces."""
+    """Leave Ctrl-C to the parent process, and the cores to the pieces; end with the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _limit_blas_threads()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """Wait for the end of the parent process, also by SIGKILL, and end this one."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def _limit_blas_threads() -> threadpool_limits:
@@ -56,5 +74,7 @@ def _compute_in_pool(plan: Plan, pieces: Sequence[int], pool: Executor) -> Itera
             jobs = {pool.submit(compute_piece, plan, piece): piece for piece in pieces}
             for job in as_completed(jobs):
                 yield jobs[job], job.result()
+        except BrokenExecutor:
+            raise RunFailedError("a process that computes the sweep has died") from None
         finally:
             pool.shutdown(cancel_futures=True)

@@ -616,6 +616,32 @@ def test_socket_of_another_program_is_left_alone(channel: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("target", ["a thesis", None], ids=["to a file", "to nowhere"])
+def test_lock_that_is_a_symbolic_link(channel: Path, target: str | None) -> None:
+    foreign = channel.with_name("thesis")
+    if target is not None:
+        foreign.write_text(target)
+    Path(f"{channel}.lock").symlink_to(foreign)
+    with pytest.raises(can.CanInitializationError, match=r"its \.lock file is a symbolic link"):
+        UnixBus(str(channel))
+    assert (foreign.read_text() if foreign.exists() else None) == target
+    assert not channel.exists()
+
+
+@pytest.mark.parametrize("make", [os.mkdir, os.mkfifo])
+def test_lock_that_is_no_file(channel: Path, make: Callable[[str], None]) -> None:
+    make(f"{channel}.lock")
+    with pytest.raises(can.CanInitializationError, match=r"its \.lock is not a regular file"):
+        UnixBus(str(channel))
+
+
+def test_content_of_a_lock_file_is_left_alone(channel: Path) -> None:
+    lock = Path(f"{channel}.lock")
+    lock.write_text("a thesis")
+    UnixBus(str(channel)).shutdown()
+    assert lock.read_text() == "a thesis"
+
+
 def test_lock_held_by_who_does_not_listen(channel: Path) -> None:
     with open(f"{channel}.lock", "wb") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)

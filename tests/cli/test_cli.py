@@ -189,7 +189,7 @@ def nothing_but_boot_up(listener: VirtualBus) -> bool:
         (["--stiffness", "-1"], "wall.stiffness_nm_per_rad: has to be greater than or equal to 0"),
         (["--duration", "0"], "run.duration_s: has to be greater than 0"),
         (["--output", "bad.toml"], "bad.toml: cannot be written"),
-        (["--output", "taken"], "taken: holds a run already; choose another --output"),
+        (["--output", "taken"], "taken: holds signals.parquet already; choose another --output"),
     ],
 )
 def test_bad_arguments(

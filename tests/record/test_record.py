@@ -7,6 +7,7 @@ import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,6 +28,7 @@ from canwall.record.columns import schema
 from canwall.record.ring import FRAMES, ROWS, to_message
 
 LAWS = ["standard", "half_sample"]
+CONFIG = "[bus]\n"
 PATIENCE_S = 30.0
 
 
@@ -228,7 +230,36 @@ def test_writer_that_dies(tmp_path: Path) -> None:
     with recording(tmp_path) as recorder:
         recorder._writer.kill()
         (note,) = recorder.close()
-    assert "the writer of the record did not finish" in note
+    assert note == f"{tmp_path}: the record is incomplete: the writer of the record has died"
+
+
+def wait_until_told(recorder: Recorder) -> str:
+    deadline = time.monotonic() + PATIENCE_S
+    while not (failure := recorder.failure()):
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    return failure
+
+
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM, signal.SIGSEGV])
+def test_writer_that_dies_is_told_at_once(tmp_path: Path, end: signal.Signals) -> None:
+    with recording(tmp_path) as recorder:
+        assert recorder.failure() == ""
+        recorder._writer.send_signal(end)
+        told = wait_until_told(recorder)
+        assert told == f"{tmp_path}: the record is incomplete: the writer of the record has died"
+        assert recorder.close() == [told]
+
+
+def test_files_that_appear_meanwhile_are_not_overwritten(tmp_path: Path) -> None:
+    for name in ("signals.arrows", "bus.log"):
+        folder, foreign = tmp_path / name.replace(".", "-"), tmp_path / "thesis"
+        folder.mkdir()
+        foreign.write_text("a thesis")
+        (folder / name).symlink_to(foreign)
+        with recording(folder) as recorder:
+            assert wait_until_told(recorder).endswith("the record is incomplete: File exists")
+        assert foreign.read_text() == "a thesis"
 
 
 def test_writer_that_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -295,9 +326,10 @@ def test_ctrl_c_does_not_end_the_writer(tmp_path: Path) -> None:
 
 
 def test_folder_is_made_with_its_parents(tmp_path: Path) -> None:
-    folder = RunFolder.create(tmp_path / "a" / "b")
+    folder = RunFolder.create(tmp_path / "a" / "b", CONFIG)
     assert folder.path.is_dir()
-    assert list(folder.path.iterdir()) == []
+    assert list(folder.path.iterdir()) == [folder.config]
+    assert folder.config.read_text() == CONFIG
     assert {p.name for p in (folder.signals, folder.summary, folder.config, folder.picture)} == {
         "signals.parquet",
         "summary.json",
@@ -308,23 +340,78 @@ def test_folder_is_made_with_its_parents(tmp_path: Path) -> None:
 
 def test_folder_of_its_own_for_every_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    first, second = RunFolder.create(None), RunFolder.create(None)
+    first, second = (RunFolder.create(None, CONFIG) for _ in range(2))
     assert first.path.parent == Path("runs")
     assert first.path != second.path
 
 
-def test_folder_that_holds_a_run_is_left_alone(tmp_path: Path) -> None:
-    (tmp_path / "signals.parquet").write_text("a thesis")
-    with pytest.raises(ConfigError, match="holds a run already; choose another --output"):
-        RunFolder.create(tmp_path)
-    assert (tmp_path / "signals.parquet").read_text() == "a thesis"
+FILES = [
+    *("signals.parquet", "signals.arrows", "summary.json", "config.toml", "run.png", "trip.csv"),
+    *("live.json", "bus.blf"),
+]
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_folder_with_a_file_of_that_name_is_left_alone(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("a thesis")
+    with pytest.raises(ConfigError, match=f"holds {name} already; choose another --output"):
+        RunFolder.create(tmp_path, CONFIG, "bus.blf")
+    assert (tmp_path / name).read_text() == "a thesis"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_nothing_is_written_through_a_symbolic_link(tmp_path: Path, name: str) -> None:
+    folder, foreign = tmp_path / "run", tmp_path / "thesis"
+    folder.mkdir()
+    (folder / name).symlink_to(foreign)  # also one that leads nowhere yet
+    with pytest.raises(ConfigError, match=f"holds {name} already"):
+        RunFolder.create(folder, CONFIG, "bus.blf")
+    assert not foreign.exists()
+
+
+def test_bus_log_of_several_drives_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "bus.log").write_text("a thesis")
+    with pytest.raises(ConfigError, match=r"holds bus\.log already"):
+        RunFolder.create(tmp_path / "node5", CONFIG, "../bus.log")
+
+
+def test_one_of_many_runs_has_the_folder(tmp_path: Path) -> None:
+    """All of them look before one of them writes."""
+    count = 8
+    looked = threading.Barrier(count)
+    made: list[RunFolder] = []
+    refused: list[str] = []
+
+    def create() -> None:
+        try:
+            made.append(RunFolder.create(tmp_path / "run", CONFIG))
+        except ConfigError as error:
+            refused.append(str(error))
+
+    claim = RunFolder._claim
+
+    def claim_at_once(folder: RunFolder, config: str) -> None:
+        looked.wait(PATIENCE_S)
+        claim(folder, config)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(RunFolder, "_claim", claim_at_once)
+        threads = [threading.Thread(target=create) for _ in range(count)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert len(made) == 1
+    line = f"{tmp_path / 'run'}: holds config.toml already; choose another --output"
+    assert refused == [line] * (count - 1)
 
 
 @pytest.mark.parametrize("where", ["file", "file/below", "/proc/canwall"])
 def test_folder_that_cannot_be_made(tmp_path: Path, where: str) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match=r"cannot be written: .*; choose another --output"):
-        RunFolder.create(tmp_path / where)
+        RunFolder.create(tmp_path / where, CONFIG)
 
 
 def test_what_is_no_record(tmp_path: Path) -> None:
@@ -394,15 +481,15 @@ def test_stream_that_was_cut_anywhere_is_readable_up_to_there(tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_disk_that_is_full_is_told_and_stops_nothing(tmp_path: Path) -> None:
+def test_disk_that_is_full_is_told_at_once(tmp_path: Path) -> None:
     rows = some_rows(ROWS // 2)
     with recording(tmp_path) as recorder:
         resource.prlimit(recorder._writer.pid, resource.RLIMIT_FSIZE, (100_000, 100_000))
         for _ in range(5):  # more than the ring holds
             put_rows(recorder.ring, rows)
             wait_until_written(recorder.ring)
-        (note,) = recorder.close()
-    assert note.startswith(f"{tmp_path}: the record is incomplete: ")
-    assert "File too large" in note
+        told = wait_until_told(recorder)
+        assert recorder.close() == [told]
+    assert told == f"{tmp_path}: the record is incomplete: File too large"
     kept = read_signals(tmp_path / "signals.parquet")
     assert 0 <= kept.num_rows < len(rows)

@@ -1,6 +1,6 @@
 """A wall that is changed from outside while it is rendered."""
 
-import json
+import os
 import re
 import signal
 import threading
@@ -303,7 +303,7 @@ def test_rubbish_in_the_mailbox_is_refused(make_rig: RigFactory, tmp_path: Path,
     refused: list[str] = []
 
     def post() -> None:
-        mailbox = Mailbox.open(json.loads(bench.folder.live.read_text())["mailbox"])
+        mailbox = Mailbox.open(bench.folder.read_live())
         with pytest.raises(ConfigError) as error:
             mailbox.post(text, PATIENCE_S)
         refused.append(str(error.value))
@@ -341,7 +341,7 @@ def test_impossible_change_is_not_posted(
 ) -> None:
     folder = RunFolder(tmp_path)
     mailbox = Mailbox.create()
-    folder.live.write_text(json.dumps({"mailbox": mailbox.address}))
+    folder.write_live(mailbox.address)
     with pytest.raises(ConfigError) as error:
         post_change(folder, assignments)
     assert str(error.value).startswith(message)
@@ -354,10 +354,60 @@ def test_run_that_is_over_takes_no_change(tmp_path: Path, monkeypatch: pytest.Mo
     with pytest.raises(ConfigError, match="no run in progress"):
         post_change(folder, ["stiffness_nm_per_rad=1"])
     mailbox = Mailbox.create()
-    folder.live.write_text(json.dumps({"mailbox": mailbox.address}))
+    folder.write_live(mailbox.address)
     monkeypatch.setattr("canwall.run.changes._PATIENCE_S", 0.01)
     monkeypatch.setattr("canwall.record.mailbox._LAST_ANSWER_S", 0.01)
     with pytest.raises(RunFailedError, match="does not take the change"):
         post_change(folder, ["stiffness_nm_per_rad=1"])
     assert mailbox.withdrawn()
     mailbox.close()
+
+
+def put_at(mailbox: Mailbox, path: Path) -> None:
+    """Put another file where the mailbox was, as another process with its number has it."""
+    with path.open("rb+") as file:
+        os.dup2(file.fileno(), mailbox.address.descriptor)
+
+
+def test_file_of_another_process_is_not_taken_for_the_mailbox(tmp_path: Path) -> None:
+    folder, foreign = RunFolder(tmp_path), tmp_path / "thesis"
+    foreign.write_bytes(bytes(10_000))
+    folder.config.write_text(settings_with().to_toml())
+    mailbox = Mailbox.create()
+    folder.write_live(mailbox.address)
+    put_at(mailbox, foreign)
+    with pytest.raises(ConfigError, match="no run in progress"):
+        post_change(folder, ["stiffness_nm_per_rad=1"])
+    # Nor is one that live.json names itself.
+    folder.write_live(mailbox.address._replace(file=str(foreign)))
+    with pytest.raises(ConfigError, match="no run in progress"):
+        post_change(folder, ["stiffness_nm_per_rad=1"])
+    mailbox.close()
+    # The same number in the next run of the same process.
+    old = Mailbox.create()
+    folder.write_live(old.address)
+    old.close()
+    new = Mailbox.create()
+    assert new.address.descriptor == old._descriptor
+    with pytest.raises(ConfigError, match="no run in progress"):
+        post_change(folder, ["stiffness_nm_per_rad=1"])
+    new.close()
+    assert foreign.read_bytes() == bytes(10_000)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "[]", "{}", "null", "5", '{"mailbox": "/proc/1/fd/1"}', "[" * 100_000, "\0"),
+        '{"pid": "1", "descriptor": 3, "file": "x"}',
+        '{"pid": 1, "descriptor": 3, "file": ["x"]}',
+        '{"pid": 1, "descriptor": 3, "file": "x", "more": 1}',
+        '{"pid": -1, "descriptor": 3, "file": "/memfd:canwall-mailbox-0 (deleted)"}',
+        '{"pid": true, "descriptor": 3, "file": "\\u0000"}',
+    ],
+)
+def test_live_file_that_is_something_else(tmp_path: Path, text: str) -> None:
+    folder = RunFolder(tmp_path)
+    folder.live.write_text(text)
+    with pytest.raises(ConfigError, match="no run in progress; give the folder of one that is"):
+        post_change(folder, ["stiffness_nm_per_rad=1"])

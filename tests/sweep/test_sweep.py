@@ -1,7 +1,14 @@
 """Sweeps: the same numbers through frames, whoever computes them, and after an interruption."""
 
+import contextlib
+import errno
 import json
+import os
+import signal
 import socket
+import sqlite3
+import subprocess
+import time
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -9,7 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from commands import command
+from commands import COMMAND, PATIENCE_S, command, wait_for
+from fork_server import ForkedPopen
 from rig import settings_with
 
 from canwall import cli
@@ -160,13 +168,228 @@ def test_a_journal_cut_short_by_a_power_cut_keeps_what_is_whole(tmp_path: Path) 
     output = tmp_path / "a.nc"
     plan = plan_of(stiffness="1:100:3")
     journal = Journal(output, "plan", resume=False)
-    journal.put(0, compute_piece(plan, 0))
-    # No close: the process is gone.
-    journal._database.close()
+    piece = compute_piece(plan, 0)
+    for number in range(3):
+        journal.put(number, piece)
+    journal.close()
+    whole = journal.path.read_bytes()
+    found = set()
+    for size in range(len(whole) + 1):
+        journal.path.write_bytes(whole[:size])
+        again = Journal(output, "plan", resume=True)
+        found.add(len(again.done()))
+        for number in again.done():
+            assert again.get(number, plan.dtype).tobytes() == piece.tobytes()
+        again.put(3, piece)  # on a line of its own
+        again.close()
+        kept = Journal(output, "plan", resume=True)
+        assert kept.done() == [*again.done()]
+        kept.close()
+    assert found == {0, 1, 2, 3}
+
+
+def some_pieces(count: int) -> list[np.ndarray[Any, Any]]:
+    random = np.random.default_rng(1)
+    return [random.random(8).view([("force", "f8")]) for _ in range(count)]
+
+
+def test_a_damaged_journal_is_never_read_as_data(tmp_path: Path) -> None:
+    """Whatever happens to the file: a piece is what was put in, or it is not there."""
+    output, pieces = tmp_path / "a.nc", some_pieces(12)
+    journal = Journal(output, "plan", resume=False)
+    for number, piece in enumerate(pieces):
+        journal.put(number, piece)
+    journal.close()
+    whole = journal.path.read_bytes()
+    lines = whole.splitlines(keepends=True)
+    random = np.random.default_rng(0)
+
+    def flipped() -> bytes:
+        data = bytearray(whole)
+        for _ in range(random.integers(1, 4)):
+            data[random.integers(len(data))] ^= 1 << random.integers(8)
+        return bytes(data)
+
+    def zeroed() -> bytes:
+        start = random.integers(len(whole))
+        end = start + random.integers(1, 400)
+        return whole[:start] + bytes(len(whole[start:end])) + whole[end:]
+
+    def shuffled() -> bytes:
+        return b"".join([lines[0], *(lines[k] for k in random.integers(1, len(lines), 15))])
+
+    def exchanged() -> bytes:
+        """The content of one piece under the number of another."""
+        words = [line.split(b" ") for line in lines[1:]]
+        a, b = random.choice(len(words), 2, replace=False)
+        words[a][0], words[b][0] = words[b][0], words[a][0]
+        return lines[0] + b"".join(b" ".join(word) for word in words)
+
+    def moved() -> bytes:
+        start, end, to = np.sort(random.integers(len(whole), size=3))
+        return whole[:start] + whole[end:to] + whole[start:end] + whole[to:]
+
+    refused = lost = 0
+    for mutation in (flipped, zeroed, shuffled, exchanged, moved):
+        for _ in range(200):
+            journal.path.write_bytes(mutation())
+            try:
+                again = Journal(output, "plan", resume=True)
+            except InputError:
+                refused += 1
+                continue
+            for number in again.done():
+                piece = again.get(number, pieces[0].dtype)
+                assert piece.tobytes() == pieces[number].tobytes()
+            lost += len(again.done()) < len(pieces)
+            again.close()
+    assert refused > 0
+    assert lost > 500
+
+
+def test_a_piece_that_is_damaged_afterwards_is_told(tmp_path: Path) -> None:
+    (piece,) = some_pieces(1)
+    journal = Journal(tmp_path / "a.nc", "plan", resume=False)
+    journal.put(0, piece)
+    data = bytearray(journal.path.read_bytes())
+    data[-5] ^= 1
+    journal.path.write_bytes(data)
+    with pytest.raises(InputError, match="piece 0 is damaged; --resume computes it again"):
+        journal.get(0, piece.dtype)
+    journal.close()
+
+
+def test_a_journal_of_another_plan_is_not_read(tmp_path: Path) -> None:
+    Journal(tmp_path / "a.nc", "plan", resume=False).close()
+    with pytest.raises(InputError, match="another configuration or other axes"):
+        Journal(tmp_path / "a.nc", "another plan", resume=True)
+
+
+def foreign_database(path: Path) -> None:
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        database.execute("CREATE TABLE letters (text TEXT)")
+        database.execute("INSERT INTO letters VALUES ('a thesis')")
+        database.commit()
+
+
+@pytest.mark.parametrize("resume", [False, True])
+@pytest.mark.parametrize("kind", ["database", "link", "link to nowhere", "directory", "fifo"])
+def test_what_is_no_journal_is_left_alone(tmp_path: Path, kind: str, resume: bool) -> None:
+    partial, foreign = tmp_path / "a.nc.partial", tmp_path / "thesis"
+    if kind == "database":
+        foreign_database(partial)
+    elif kind == "directory":
+        partial.mkdir()
+    elif kind == "fifo":
+        os.mkfifo(partial)
+    else:
+        if kind == "link":
+            foreign_database(foreign)
+        partial.symlink_to(foreign)
+    before = foreign.read_bytes() if foreign.exists() else b""
+    own = partial.read_bytes() if kind == "database" else b""
+    message = "holds no unfinished sweep; remove it" if resume else "holds an unfinished sweep"
+    with pytest.raises(InputError, match=message):
+        Journal(tmp_path / "a.nc", "plan", resume)
+    assert (foreign.read_bytes() if foreign.exists() else b"") == before
+    assert (partial.read_bytes() if kind == "database" else b"") == own
+
+
+def test_two_sweeps_do_not_share_a_journal(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "a.nc", "plan", resume=False)
+    with pytest.raises(InputError, match="another sweep is writing it; let that end"):
+        Journal(tmp_path / "a.nc", "plan", resume=True)
+    journal.close()
+    Journal(tmp_path / "a.nc", "plan", resume=True).remove()
+
+
+def test_a_full_disk_leaves_a_journal_that_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output, pieces = tmp_path / "a.nc", some_pieces(3)
+    journal = Journal(output, "plan", resume=False)
+    room = journal.path.stat().st_size + 300  # one piece, and a part of the next
+    write = os.write
+
+    def write_what_fits(file: int, data: memoryview) -> int:
+        fits = room - os.fstat(file).st_size
+        if not fits:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write(file, data[:fits])
+
+    monkeypatch.setattr(os, "write", write_what_fits)
+    journal.put(0, pieces[0])
+    with pytest.raises(InputError, match="cannot be written: No space left on device"):
+        journal.put(1, pieces[1])
+    journal.close()
+    monkeypatch.undo()
     again = Journal(output, "plan", resume=True)
     assert again.done() == [0]
-    assert again.get(0, plan.dtype).tobytes() == compute_piece(plan, 0).tobytes()
+    again.put(1, pieces[1])
+    for number in (0, 1):
+        assert again.get(number, pieces[0].dtype).tobytes() == pieces[number].tobytes()
     again.remove()
+    room = 0
+    monkeypatch.setattr(os, "write", write_what_fits)
+    with pytest.raises(InputError, match="No space left on device"):
+        Journal(output, "plan", resume=False)
+    assert not journal.path.exists()  # nothing stands in the way of the next attempt
+
+
+def workers_of(parent: int) -> list[int]:
+    """Processes that compute for a sweep by frames."""
+    children = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
+    named = {child: Path(f"/proc/{child}/cmdline").read_bytes() for child in children}
+    return [int(child) for child, line in named.items() if b"spawn_main" in line]
+
+
+def is_alive(process: int) -> bool:
+    try:
+        state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return state != "Z"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM])
+def test_workers_end_with_their_parent(tmp_path: Path, end: signal.Signals) -> None:
+    words = ["--axis", "speed=0.5:2:40", "--axis", "phase=0:1:9", "--through", "bus"]
+    sweeping = ForkedPopen[str](
+        [COMMAND, "sweep", str(settings_file()), "--output", str(tmp_path / "a.nc"), *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    with sweeping:
+        try:
+            wait_for(lambda: sweeping.poll() is None and len(workers_of(sweeping.pid)) > 0)
+            workers = workers_of(sweeping.pid)
+            time.sleep(3.0)  # into its work, or still its start
+        finally:
+            sweeping.send_signal(end)
+        wait_for(lambda: not any(map(is_alive, workers)))
+
+
+@pytest.mark.slow
+def test_a_worker_that_dies_is_one_line(tmp_path: Path) -> None:
+    words = ["--axis", "speed=0.5:2:40", "--axis", "phase=0:1:9", "--through", "bus"]
+    sweeping = ForkedPopen[str](
+        [COMMAND, "sweep", str(settings_file()), "--output", str(tmp_path / "a.nc"), *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    with sweeping:
+        try:
+            wait_for(lambda: sweeping.poll() is None and len(workers_of(sweeping.pid)) > 0)
+            os.kill(workers_of(sweeping.pid)[0], signal.SIGKILL)
+            _, errors = sweeping.communicate(timeout=PATIENCE_S)
+        finally:
+            sweeping.kill()
+    assert sweeping.returncode == 1
+    line = f"a process that computes the sweep has died; --resume continues {tmp_path}/a.nc"
+    assert errors == f"canwall: {line}\n"
 
 
 @pytest.mark.parametrize(
