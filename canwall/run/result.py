@@ -26,6 +26,7 @@ class RunResult:
         outcome: How the loop ended.
         notes: What the record lacks.
         remarks: What the drive does not do as configured.
+        not_restored: Changes in the drive that `[drive] restore` could not undo.
     """
 
     folder: RunFolder
@@ -33,6 +34,7 @@ class RunResult:
     outcome: Outcome
     notes: list[str]
     remarks: list[str]
+    not_restored: list[str]
 
 
 def write_result(
@@ -44,6 +46,7 @@ def write_result(
     outcome: Outcome,
     notes: list[str],
     remarks: list[str],
+    not_restored: list[str],
 ) -> RunResult:
     """Write the summary of one axis, and its last cycles if it tripped.
 
@@ -75,7 +78,7 @@ def write_result(
     folder.summary.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     if outcome.trip_cycle is not None:
         folder.write_trip(signals, outcome.trip_cycle)
-    return RunResult(folder, summary, outcome, notes, remarks)
+    return RunResult(folder, summary, outcome, notes, remarks, not_restored)
 
 
 def _real_time_summary(axis: WallAxis, exchange: Exchange) -> dict[str, Any]:

@@ -1,16 +1,15 @@
 """PDO parameters: the order of CiA 301 (7.5.2.35 to 38) is accepted, everything else refused."""
 
-import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from canopen import SdoAbortedError
+from rig import eds_with
 from simdrive_bench import (
     ACTUAL_TORQUE,
     CONTROLWORD,
-    EDS,
     NO_RTR,
     NOT_VALID,
     POSITION,
@@ -137,14 +136,6 @@ def test_refused_write_leaves_the_pdo_as_it_is(bench: Bench) -> None:
     assert bench.nmt(START)[0] == (TPDO[1], b"\x00\x00")
 
 
-def edited(path: Path, section: str, key: str, value: str) -> Path:
-    """The drive's EDS with another value of a key."""
-    before, head, rest = EDS.read_text().partition(f"[{section}]\n")
-    assert head
-    path.write_text(before + head + re.sub(rf"{key}=.*", f"{key}={value}", rest, count=1))
-    return path
-
-
 def test_sync_elsewhere_takes_its_identifier(bench: Bench) -> None:
     bench.write(0x1005, 0, 0x1F1, 4)
     for cob_id in (0x1F1, 0x080):  # others may still produce the usual one
@@ -155,7 +146,9 @@ def test_sync_elsewhere_takes_its_identifier(bench: Bench) -> None:
 @pytest.mark.parametrize("unserved", [0x60990010, 0x10000020, 0x60410110])
 def test_mapping_of_the_file_that_is_not_served_is_a_gap(tmp_path: Path, unserved: int) -> None:
     """As Elmo's 0x1601, which maps 0x2013: nobody has to use it, and it can be put back."""
-    bench = Bench(edited(tmp_path / "gap.eds", "1A00sub1", "DefaultValue", f"{unserved:#010x}"))
+    bench = Bench(
+        eds_with(tmp_path / "gap.eds", {("1A00sub1", "DefaultValue"): f"{unserved:#010x}"})
+    )
     assert bench.nmt(START)[0] == (TPDO[1], bytes((unserved & 0xFF) // 8))
     bench.configure_pdo(0x1800, NO_RTR | TPDO[1], 255, [STATUSWORD])
     bench.configure_pdo(0x1800, NO_RTR | TPDO[1], 255, [unserved])
@@ -166,7 +159,7 @@ def test_mapping_of_the_file_that_is_not_served_is_a_gap(tmp_path: Path, unserve
 
 def test_empty_pdo_that_begins_valid_may_be_so_again(tmp_path: Path) -> None:
     """As Elmo's Whistle has it."""
-    bench = Bench(edited(tmp_path / "empty.eds", "1600sub0", "DefaultValue", "0"))
+    bench = Bench(eds_with(tmp_path / "empty.eds", {("1600sub0", "DefaultValue"): "0"}))
     before = bench.read(0x1400, 1)
     assert not before & NOT_VALID
     assert bench.read(0x1600, 0) == 0
@@ -181,7 +174,7 @@ def test_empty_pdo_that_begins_valid_may_be_so_again(tmp_path: Path) -> None:
 
 def test_mapping_changes_while_valid_if_the_identifier_is_read_only(tmp_path: Path) -> None:
     """As Elmo's SimplIQ has it."""
-    bench = Bench(edited(tmp_path / "fixed.eds", "1800sub1", "AccessType", "ro"))
+    bench = Bench(eds_with(tmp_path / "fixed.eds", {("1800sub1", "AccessType"): "ro"}))
     bench.nmt(START)
     bench.write(0x1A00, 0, 0, 1)
     assert TPDO[1] not in [can_id for can_id, _ in bench.sync()]
