@@ -9,6 +9,7 @@ from canopen.emcy import EmcyError
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
+from canwall.bus.can_ids import ERROR_CONTROL
 from canwall.drive.link import Link
 from canwall.drive.objects import DEVICE_TYPE
 from canwall.errors import RunFailedError
@@ -26,7 +27,11 @@ class DriveError(RunFailedError):
 
 
 class DriveNode:
-    """A node on the bus, with its objects by index and sub-index."""
+    """A node on the bus, with its objects by index and sub-index.
+
+    Attributes:
+        boot_ups: Number of its boot-up messages so far.
+    """
 
     def __init__(
         self, link: Link, node_id: int, dictionary: ObjectDictionary, sdo_timeout_s: float = 0.5
@@ -36,8 +41,13 @@ class DriveNode:
         self.dictionary = dictionary
         self._node = link.add_node(node_id, dictionary)
         self._node.sdo.RESPONSE_TIMEOUT = sdo_timeout_s
+        self.boot_ups = 0
+        link.network.subscribe(ERROR_CONTROL + node_id, self._error_control)
         self._asked: dict[tuple[int, int], bool] = {}
         self._changes: list[tuple[int, int, bytes | None]] = []
+
+    def _error_control(self, can_id: int, data: bytearray, timestamp: float) -> None:
+        self.boot_ups += data == b"\0"
 
     @property
     def emergencies(self) -> list[EmcyError]:

@@ -97,6 +97,7 @@ def set_up(
             provide, and what differs from its object dictionary.
     """
     node.wait_until_present(settings.wait_s)
+    boot_ups = node.boot_ups
     node.command("PRE-OPERATIONAL")
     identity = identify(node)
     node.refuse_twin()
@@ -116,8 +117,13 @@ def set_up(
     except DriveError as error:
         troubles.append(str(error))
     node.refuse_twin()
+    if node.boot_ups > boot_ups:
+        troubles.append(
+            f"node {node.node_id} sent a boot-up message: it restarted during the set-up, or a "
+            f"second drive with its node-ID started"
+        )
     differences = [*identity.doubts, *_absent(node)]
-    if scales is None or prepared is None:
+    if troubles or scales is None or prepared is None:
         raise DriveError("; ".join([*troubles, *differences]))
     node.command("OPERATIONAL")
     return DriveSetup(

@@ -106,6 +106,20 @@ def test_doctor_names_two_drives(twins: Rig) -> None:
         examine(twins.link, twins.settings, REQUIRED_OBJECTS, lambda step: None, Findings())
 
 
+def test_boot_up_during_the_set_up(rig: Rig) -> None:
+    note = rig.link.log
+    assert note is not None
+
+    def switch_on(time_s: float, message: can.Message, received: bool) -> None:
+        note(time_s, message, received)
+        if (message.arbitration_id, message.data[1:3]) == (SDO_REQUEST, b"\x02\x65"):
+            rig.inject(0x705, b"\0")
+
+    rig.link.log = switch_on
+    with pytest.raises(DriveError, match=r"restarted during the set-up, or a second drive with"):
+        rig.set_up()
+
+
 def test_one_drive_is_one(rig: Rig) -> None:
     rig.set_up()
     assert rig.node._node.sdo.doubled == 0
