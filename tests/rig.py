@@ -1,6 +1,7 @@
 """A simulated drive and its master on one virtual bus, in one thread: what several tests need."""
 
 import itertools
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -136,7 +137,7 @@ class Rig:
         self.link.log = self._note
         self.frames: list[tuple[int, bytes]] = []
         dictionary = load_eds(self.settings.drive.eds, 5, REQUIRED_OBJECTS)
-        self.node = DriveNode(self.link, 5, dictionary)
+        self.node = DriveNode(self.link, 5, dictionary, self.settings.drive.sdo_timeout_s)
 
     def _note(self, time_s: float, message: can.Message, received: bool) -> None:
         self.frames.append((message.arbitration_id, bytes(message.data)))
@@ -146,7 +147,10 @@ class Rig:
         self.drive_bus.shutdown()
 
     def set_up(self) -> DriveSetup:
-        return set_up(self.node, self.settings.drive, self.settings.bus, self.settings.real_time)
+        settings = self.settings
+        return set_up(
+            self.node, settings.drive, settings.bus, settings.limits.torque_nm, settings.real_time
+        )
 
     def inject(self, can_id: int, data: bytes) -> None:
         """A frame of somebody else, for master and drive."""
@@ -216,4 +220,14 @@ def eds_without(path: Path, *sections: str) -> Path:
         if keep:
             kept.append(line)
     path.write_text("\n".join(kept))
+    return path
+
+
+def eds_with(path: Path, changes: Mapping[tuple[str, str], str]) -> Path:
+    """The drive's EDS with other values, by section and key, e.g. ("1800sub1", "AccessType")."""
+    text = (SIM_CONFIG.parent.parent / "eds" / "canwall-drive.eds").read_text()
+    for (section, key), value in changes.items():
+        before, head, rest = text.partition(f"[{section}]\n")
+        text = before + head + re.sub(rf"{key}=.*", f"{key}={value}", rest, count=1)
+    path.write_text(text)
     return path

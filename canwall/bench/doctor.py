@@ -68,12 +68,12 @@ def examine(
     """
     settings = measurement_settings(settings)
     dictionary = load_eds(settings.drive.eds, settings.drive.node_id, required)
-    node = DriveNode(link, settings.drive.node_id, dictionary)
+    node = DriveNode(link, settings.drive.node_id, dictionary, settings.drive.sdo_timeout_s)
     try:
         announce("setting the drive up; nothing is enabled")
         # In doubt the doctor goes on: that there is no watchdog is a finding, not an end.
         lenient = settings.drive.model_copy(update={"accept_no_watchdog": True})
-        setup = set_up(node, lenient, settings.bus, real_time=True)
+        setup = set_up(node, lenient, settings.bus, settings.limits.torque_nm, real_time=True)
         _describe(setup, settings, findings)
         _describe_budget(node, setup, settings, findings)
         _test(node, setup, settings, announce, findings)

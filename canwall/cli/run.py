@@ -73,12 +73,12 @@ def run(
             console.print(advice, soft_wrap=True, highlight=False, markup=False)
         for remark in result.remarks:
             say(remark)
-        for note in result.notes:
+        for note in (*result.not_restored, *result.notes):
             say(note)
     outcome = results[0].outcome
     for trip in outcome.trips:
         say(trip)
-    if outcome.trips or any(result.notes for result in results):
+    if outcome.trips or any(result.notes or result.not_restored for result in results):
         return FAILED
     return INTERRUPTED if outcome.interrupted else 0
 

@@ -17,6 +17,9 @@ def _check_object_names(value: dict[str, int]) -> dict[str, int]:
     return value
 
 
+#: Unit of 0x6076 in CiA 402-2 [N·m].
+MILLI_NM = 1e-3
+
 #: Values of objects, by "0xINDEX" or "0xINDEX:SUB".
 Objects = Annotated[dict[str, int], AfterValidator(_check_object_names)]
 
@@ -38,7 +41,9 @@ class Drive(Section):
     them that the drive has. torque_pdo: a torque acts at the next SYNC, or on reception
     ("immediate"). parameters: written at the set-up. download_dcf: write the values of the DCF
     first. restore: undo all changes at the end. watchdog_s: silence of the master after which the
-    drive disables itself. wait_s: how long to wait for the drive to answer.
+    drive disables itself. wait_s: how long to wait for the drive to answer. sdo_timeout_s: how
+    long to wait for the answer to one SDO request. rated_torque_unit_nm: unit of 0x6076 in N·m;
+    CiA 402 has 1e-3, some manufacturers 1e-6.
     """
 
     node_id: int = Field(ge=1, le=127)
@@ -46,6 +51,7 @@ class Drive(Section):
     mode: Literal["auto", "cst", "pt"] = "auto"
     torque_pdo: Literal["sync", "immediate"] = "sync"
     rated_torque_nm: Positive | None = None
+    rated_torque_unit_nm: Annotated[Positive, Field(ge=1e-9, le=1.0)] | None = None
     counts_per_rev: Positive | None = None
     gear_ratio: Positive | None = None
     parameters: Objects = Field(default_factory=dict)
@@ -54,6 +60,7 @@ class Drive(Section):
     watchdog_s: Annotated[Positive, Field(ge=0.003, le=60.0)] = 0.1
     accept_no_watchdog: bool = False
     wait_s: NonNegative = 5.0
+    sdo_timeout_s: Annotated[Positive, Field(ge=0.001, le=10.0)] = 0.5
 
     @property
     def parameters_by_index(self) -> dict[tuple[int, int], int]:

@@ -1,4 +1,4 @@
-"""Frames outside the cycle that end a wall: EMCY, another NMT state, bus-off, a second SYNC."""
+"""Frames outside the cycle that end a wall: EMCY, NMT states, bus-off, a second SYNC or drive."""
 
 from collections.abc import Sequence
 
@@ -10,9 +10,15 @@ from canwall.cycle.axis import WallAxis
 from canwall.drive import Link
 
 _OPERATIONAL, _BOOT_UP = 5, 0
-_NMT_STATES = {_BOOT_UP: "restarted", 4: "is in NMT STOPPED", 127: "is in NMT PRE-OPERATIONAL"}
+_NMT_STATES = {
+    _BOOT_UP: "restarted, or a second one with its node-ID started",
+    4: "is in NMT STOPPED",
+    127: "is in NMT PRE-OPERATIONAL",
+}
 #: Class of an error frame, as Linux's SocketCAN has it in the identifier (linux/can/error.h).
 _BUS_OFF = 0x40
+#: TPDOs beyond one for each SYNC, late ones aside, that prove a second sender.
+_SURPLUS = 10
 
 
 class BusMonitor:
@@ -32,8 +38,10 @@ class BusMonitor:
         self._axes = axes
         self.error_frames = 0
         self.notes: list[str] = []
+        self._surplus = dict.fromkeys((axis.setup.tpdo.cob_id for axis in axes), 0)
         for axis in axes:
             node_id = axis.node.node_id
+            link.network.subscribe(axis.setup.tpdo.cob_id, self._another_tpdo)
             link.network.subscribe(EMCY + node_id, self._emergency)
             link.network.subscribe(ERROR_CONTROL + node_id, self._error_control)
         if sync_cob_id is not None:
@@ -59,6 +67,18 @@ class BusMonitor:
             return
         state = data[0] & 0x7F
         axis.give_up(f"the drive {_NMT_STATES.get(state, f'is in NMT state {state}')}")
+
+    def _another_tpdo(self, can_id: int, data: bytearray, timestamp: float) -> None:
+        axis = next(axis for axis in self._axes if axis.setup.tpdo.cob_id == can_id)
+        if not axis.active:
+            return
+        self._surplus[can_id] += 1
+        # One that comes late was counted as missing.
+        if self._surplus[can_id] - int(axis.cycle["missed_tpdo"][0]) >= _SURPLUS:
+            axis.give_up(
+                f"more than one TPDO ({can_id:#05x}) for each SYNC: two drives have node-ID "
+                f"{axis.node.node_id}, or another node sends under this identifier"
+            )
 
     def _another_sync(self, can_id: int, data: bytearray, timestamp: float) -> None:
         for axis in self._axes:

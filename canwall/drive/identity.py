@@ -7,8 +7,8 @@ from canwall.drive.node import DriveError, DriveNode
 
 _DRIVE_PROFILE = 402
 _PARTS = {1: "vendor-ID", 2: "product code", 3: "revision number", 4: "serial number"}
-#: Parts that differ if the dictionary is another drive's.
-_VENDOR, _PRODUCT = 1, 2
+#: Parts that differ if the dictionary is another drive's, or another firmware's.
+_OF_FILE = {1: "drive", 2: "drive", 3: "firmware"}
 
 
 @dataclass(frozen=True)
@@ -43,12 +43,16 @@ def identify(node: DriveNode) -> Identity:
     doubts = []
     if not profile:
         doubts.append("0x1000 names no device profile: assumed to be a drive")
-    for part in (_VENDOR, _PRODUCT):
-        variable = node.dictionary.get_variable(od.IDENTITY, part)
+    found = {(od.DEVICE_TYPE, 0): ("device type", device_type, "drive")} | {
+        (od.IDENTITY, i): (_PARTS[i], numbers[i], whose)
+        for i, whose in _OF_FILE.items()
+        if i in numbers
+    }
+    for key, (name, value, whose) in found.items():
+        variable = node.dictionary.get_variable(*key)
         expected = variable.default if variable is not None else None
-        if expected and part in numbers and numbers[part] != expected:
+        if value and expected and value != expected:
             doubts.append(
-                f"{_PARTS[part]} {numbers[part]:#x}, but {expected:#x} in drive.eds: is it this "
-                f"drive's file?"
+                f"{name} {value:#x}, but {expected:#x} in drive.eds: is it this {whose}'s file?"
             )
     return Identity(device_type, numbers, tuple(doubts))

@@ -10,6 +10,7 @@ import errno
 import logging
 import struct
 import time
+from collections import deque
 from collections.abc import Callable, Container
 
 import can
@@ -29,6 +30,8 @@ _ANSWERS = {0: 1, 1: 3, 2: 2, 3: 0}
 _ABORT = 4
 #: Requests whose answer repeats index and subindex.
 _INITIATE = (1, 2)
+#: Latest requests among which a second answer is looked for.
+_REMEMBERED = 16
 
 #: Logs a frame: time [s], message, True if it was received, False if it was sent.
 FrameLog = Callable[[float, can.Message, bool], None]
@@ -148,6 +151,20 @@ class Link:
             self.dispatch(message)
         return message is not None
 
+    def find_nodes(self, patience_s: float) -> list[int]:
+        """Ask all nodes for their device type; return the node-IDs under which frames come.
+
+        A failure of the bus counts as silence. patience_s: time to listen [s].
+        """
+        scanner = self.network.scanner
+        scanner.reset()
+        deadline = time.monotonic() + patience_s
+        with contextlib.suppress(can.CanError):
+            scanner.search()
+            while (remaining := deadline - time.monotonic()) > 0.0:
+                self.serve(remaining)
+        return sorted(scanner.nodes)
+
     def add_node(self, node_id: int, dictionary: canopen.ObjectDictionary) -> canopen.RemoteNode:
         """Add a remote node whose SDO transfers read this link."""
         return self.network.add_node(_Node(node_id, dictionary, self))
@@ -203,27 +220,43 @@ class _Node(canopen.RemoteNode):  # type: ignore[misc]
 
 
 class _Sdo(SdoClient):  # type: ignore[misc]
-    """canopen's SDO client, which reads the bus itself while it waits."""
+    """canopen's SDO client, which reads the bus itself while it waits.
+
+    Attributes:
+        doubled: Number of second answers to requests that were answered in time.
+    """
 
     def __init__(self, rx: int, tx: int, dictionary: canopen.ObjectDictionary, link: Link) -> None:
         super().__init__(rx, tx, dictionary)
         self._link = link
         self._request = bytes(8)
+        self._awaiting = False
+        self._answered: deque[bytes] = deque(maxlen=_REMEMBERED)
+        self.doubled = 0
 
     def send_request(self, request: bytearray) -> None:
         self._request = bytes(request)
+        self._awaiting = True
         super().send_request(request)
 
     def on_response(self, can_id: int, data: bytearray, timestamp: float) -> None:
         # Ignore an answer that is late for an earlier request, or meant for another master.
-        if len(data) == 8 and self._answers(data):
+        if len(data) != 8:
+            return
+        if self._awaiting and self._answers(data):
+            self._awaiting = False
+            self._answered.append(_head(data))
             super().on_response(can_id, data, timestamp)
+        elif _head(data) in self._answered:
+            self._answered.remove(_head(data))
+            self.doubled += 1
 
     def _answers(self, data: bytearray) -> bool:
         specifier, asked = data[0] >> 5, self._request[0] >> 5
-        if specifier == _ABORT:
-            return True
         same = asked not in _INITIATE or data[1:4] == self._request[1:4]
+        if specifier == _ABORT:
+            # Some drives leave index and subindex out of their aborts.
+            return same or not any(data[1:4])
         return specifier == _ANSWERS.get(asked) and same
 
     def read_response(self) -> bytes:
@@ -231,7 +264,16 @@ class _Sdo(SdoClient):  # type: ignore[misc]
         while self.responses.empty():
             remaining = deadline - time.monotonic()
             if remaining <= 0.0:
-                raise SdoCommunicationError("No SDO response received")
+                # Both this answer and that to a repetition may still come.
+                self._answered.clear()
+                raise SdoCommunicationError(
+                    f"no answer within {self.RESPONSE_TIMEOUT:g} s (drive.sdo_timeout_s)"
+                )
             self._link.serve(remaining)
         response: bytes = super().read_response()
         return response
+
+
+def _head(data: bytearray) -> bytes:
+    """Return the command specifier of an answer, with index and subindex."""
+    return bytes([data[0] >> 5]) + bytes(data[1:4])

@@ -1,5 +1,6 @@
 """A drive as seen by its master outside the cycle: objects over SDO, NMT and EMCY."""
 
+import contextlib
 import time
 from collections.abc import Iterator
 
@@ -8,9 +9,17 @@ from canopen.emcy import EmcyError
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
+from canwall.bus.can_ids import ERROR_CONTROL
 from canwall.drive.link import Link
 from canwall.drive.objects import DEVICE_TYPE
 from canwall.errors import RunFailedError
+
+#: SDO abort codes of an object, or a sub-index, that a drive does not have.
+_NO_OBJECT = (0x0602_0000, 0x0609_0011)
+#: Time to wait for an answer that is late [s].
+_LATE_S = 0.5
+#: Second answers that prove a second drive.
+_DOUBLED = 3
 
 
 class DriveError(RunFailedError):
@@ -18,14 +27,27 @@ class DriveError(RunFailedError):
 
 
 class DriveNode:
-    """A node on the bus, with its objects by index and sub-index."""
+    """A node on the bus, with its objects by index and sub-index.
 
-    def __init__(self, link: Link, node_id: int, dictionary: ObjectDictionary) -> None:
+    Attributes:
+        boot_ups: Number of its boot-up messages so far.
+    """
+
+    def __init__(
+        self, link: Link, node_id: int, dictionary: ObjectDictionary, sdo_timeout_s: float = 0.5
+    ) -> None:
         self.link = link
         self.node_id = node_id
         self.dictionary = dictionary
         self._node = link.add_node(node_id, dictionary)
+        self._node.sdo.RESPONSE_TIMEOUT = sdo_timeout_s
+        self.boot_ups = 0
+        link.network.subscribe(ERROR_CONTROL + node_id, self._error_control)
+        self._asked: dict[tuple[int, int], bool] = {}
         self._changes: list[tuple[int, int, bytes | None]] = []
+
+    def _error_control(self, can_id: int, data: bytearray, timestamp: float) -> None:
+        self.boot_ups += data == b"\0"
 
     @property
     def emergencies(self) -> list[EmcyError]:
@@ -33,8 +55,31 @@ class DriveNode:
         log: list[EmcyError] = self._node.emcy.log
         return log
 
+    @property
+    def absent(self) -> list[str]:
+        """Names of the objects of the dictionary that the drive, when asked, did not have."""
+        return [_name(*key) for key, present in self._asked.items() if not present]
+
     def has(self, index: int, subindex: int = 0) -> bool:
-        """Return whether the object dictionary lists this object."""
+        """Return whether the object dictionary lists this object and the drive has it.
+
+        The drive is asked once. An object that it does not answer for counts as present.
+        """
+        key = index, subindex
+        if not self._lists(index, subindex):
+            return False
+        if key not in self._asked:
+            try:
+                self._node.sdo.upload(index, subindex)
+            except SdoAbortedError as abort:
+                self._asked[key] = abort.code not in _NO_OBJECT
+            except (SdoCommunicationError, can.CanError):
+                return True
+            else:
+                self._asked[key] = True
+        return self._asked[key]
+
+    def _lists(self, index: int, subindex: int) -> bool:
         item = self.dictionary.get(index)
         if item is None or isinstance(item, ODVariable):
             return item is not None and subindex == 0
@@ -124,7 +169,11 @@ class DriveNode:
         self._node.nmt.state = nmt
 
     def wait_until_present(self, timeout_s: float) -> None:
-        """Read the device type until the drive answers. Raises DriveError."""
+        """Read the device type until the drive answers.
+
+        Raises:
+            DriveError: If it does not answer; names the nodes that do.
+        """
         deadline = time.monotonic() + timeout_s
         while True:
             try:
@@ -132,10 +181,33 @@ class DriveNode:
                 return
             except DriveError:
                 if time.monotonic() >= deadline:
-                    raise DriveError(
-                        f"node {self.node_id} does not answer; is the drive on, on this bus, at "
-                        f"this bit rate, and is drive.node_id right?"
-                    ) from None
+                    raise DriveError(self._why_silent()) from None
+                # A node in STOPPED does not answer SDO requests.
+                with contextlib.suppress(can.CanError):
+                    self.command("PRE-OPERATIONAL")
+
+    def _why_silent(self) -> str:
+        timeout_s = float(self._node.sdo.RESPONSE_TIMEOUT)
+        silent = f"node {self.node_id} does not answer within {timeout_s:g} s"
+        others = self.link.find_nodes(max(_LATE_S, 2.0 * timeout_s))
+        if self.node_id in others:
+            return f"{silent}, but is on the bus: raise drive.sdo_timeout_s"
+        if not others:
+            return (
+                f"{silent}, nor does any other; is the drive on, on this bus, at this bit rate, "
+                f"and is drive.node_id right?"
+            )
+        listed = ", ".join(str(node_id) for node_id in others)
+        do = f"node {listed} does" if len(others) == 1 else f"nodes {listed} do"
+        return f"{silent}, but {do}: is drive.node_id right, and is the drive on?"
+
+    def refuse_twin(self) -> None:
+        """Raise DriveError if every request is answered twice."""
+        if self._node.sdo.doubled >= _DOUBLED:
+            raise DriveError(
+                f"two drives have node-ID {self.node_id}: requests to it are answered twice; "
+                f"give one of them another node-ID"
+            )
 
     def _upload(self, index: int, subindex: int) -> bytes:
         try:
@@ -154,7 +226,11 @@ class DriveNode:
             raise self._failed(f"writing {value:#x} to", index, subindex, error) from None
 
     def _failed(self, doing: str, index: int, subindex: int, error: Exception) -> DriveError:
-        return DriveError(f"node {self.node_id}: {doing} {_name(index, subindex)} failed: {error}")
+        text = f"node {self.node_id}: {doing} {_name(index, subindex)} failed: {error}"
+        lacking = isinstance(error, SdoAbortedError) and error.code in _NO_OBJECT
+        if lacking and self._lists(index, subindex):
+            text += "; drive.eds has it: is it this drive's file?"
+        return DriveError(text)
 
 
 def _name(index: int, subindex: int) -> str:

@@ -123,14 +123,25 @@ def configure_rpdo(
 def while_off(node: DriveNode, communication: int) -> Iterator[None]:
     """Switch a PDO off for the duration of the context, so that its parameters can change."""
     cob_id = node.read(communication, 1)
-    if cob_id & _INVALID:
-        yield
-        return
-    node.change(communication, 1, cob_id | _INVALID)
+    switched_off = not cob_id & _INVALID and _switch_off(node, communication, cob_id)
     try:
         yield
     finally:
-        node.change(communication, 1, cob_id)
+        if switched_off:
+            node.change(communication, 1, cob_id)
+
+
+def _switch_off(node: DriveNode, communication: int, cob_id: int) -> bool:
+    """Set bit 31 of a COB-ID; return False if the drive refuses.
+
+    Drives with fixed COB-IDs (Elmo SimplIQ) take other changes while the PDO is valid.
+    """
+    try:
+        # The other bits stay as they are: some drives refuse to clear bit 30.
+        node.change(communication, 1, cob_id | _INVALID)
+    except DriveError:
+        return False
+    return True
 
 
 def _mapping_choices(
@@ -190,12 +201,11 @@ def _missing_objects(first: int, needed: Sequence[int], present: Sequence[PdoLay
 
 
 def _write_mapping(node: DriveNode, communication: int, objects: list[int]) -> PdoLayout:
-    # CiA 301, 7.5.2.36: switch the PDO off, empty the mapping, write it, set its length. The other
-    # bits of the COB-ID stay as they are: some drives refuse to clear bit 30.
+    # CiA 301, 7.5.2.36: switch the PDO off, empty the mapping, write it, set its length.
     mapping = communication + _MAPPING_OFFSET
     entries = [_entry(node, index) for index in objects]
     cob_id = node.read(communication, 1)
-    node.change(communication, 1, cob_id | _INVALID)
+    _switch_off(node, communication, cob_id)
     node.change(mapping, 0, 0)
     for position, entry in enumerate(entries, start=1):
         node.change(mapping, position, entry, size=4)

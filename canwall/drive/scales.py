@@ -1,10 +1,13 @@
 """Scales of a drive, one count and one per mille: from the configuration or the drive's objects."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from canwall.config import Drive as DriveSettings
+from canwall.config.drive import MILLI_NM
 from canwall.drive import objects as od
+from canwall.drive.identity import Identity
 from canwall.drive.node import DriveError, DriveNode
 from canwall.units import DriveUnits
 
@@ -16,6 +19,16 @@ _INCREMENTS = (0xB5, 0x00)
 
 #: Bits of 0x607E: position, and torque with some manufacturers.
 _REVERSED = 1 << 7 | 1 << 5
+
+#: Unit of 0x6076 that drives use instead of CiA 402-2's [N·m].
+_MICRO_NM = 1e-6
+#: maxon: its vendor-ID (0x1018:01), and in 0x3001 nominal current [mA], torque constant [µN·m/A].
+_VENDOR, _MAXON = 1, 0xFB
+_MAXON_MOTOR, _MAXON_CURRENT, _MAXON_CONSTANT = 0x3001, 1, 5
+_SAME = 0.02
+
+#: Plausible `limits.torque_nm`: least in steps of one per mille, most in rated torques.
+_LEAST_STEPS, _MOST_RATED = 10.0, 20.0
 
 _GIVE_COUNTS = "give drive.counts_per_rev (increments per turn of the motor)"
 
@@ -35,20 +48,42 @@ class Scales:
     sources: tuple[tuple[str, str], ...]
 
 
-def read_scales(node: DriveNode, settings: DriveSettings) -> Scales:
+def read_scales(
+    node: DriveNode, settings: DriveSettings, identity: Identity, torque_nm: float
+) -> Scales:
     """Read the scales from 0x608F, 0x6091, 0x6092, 0x60A8 and 0x6076, unless `[drive]` has them.
 
-    Raises DriveError that names the key to give for a scale that cannot be read.
+    Args:
+        node: The drive.
+        settings: `[drive]`.
+        identity: Identity of the drive.
+        torque_nm: `limits.torque_nm`; a rated torque that does not suit it is not believed.
+
+    Raises:
+        DriveError: If a scale cannot be read or believed; names the key to give for each.
     """
-    _check_polarity(node)
-    gear, gear_source = _gear_ratio(node, settings)
-    counts, counts_source = _counts_per_rev(node, settings, gear)
-    rated, rated_source = _rated_torque(node, settings)
+    troubles: list[str] = []
+
+    def found(read: Callable[[], tuple[float, str]]) -> tuple[float, str]:
+        try:
+            return read()
+        except DriveError as error:
+            troubles.append(str(error))
+            return 1.0, ""
+
+    gear, gear_source = found(lambda: _gear_ratio(node, settings))
+    counts, counts_source = found(lambda: _counts_per_rev(node, settings, gear))
+    rated, rated_source = found(lambda: _rated_torque(node, settings, identity, torque_nm / gear))
+    per_mille, limit_source = found(lambda: _torque_limit(node))
     try:
+        _check_polarity(node)
         units = DriveUnits(counts, rated * gear)
+    except DriveError as error:
+        troubles.append(str(error))
     except ValueError as error:
-        raise DriveError(f"node {node.node_id}: {error}; correct it in [drive]") from None
-    per_mille, limit_source = _torque_limit(node)
+        troubles.append(f"node {node.node_id}: {error}; correct it in [drive]")
+    if troubles:
+        raise DriveError("; ".join(troubles))
     limit_nm = per_mille * units.nm_per_mille
     return Scales(
         units,
@@ -103,12 +138,40 @@ def _counts_per_rev(node: DriveNode, settings: DriveSettings, gear: float) -> tu
     return counts * gear, "0x608F" + (" and the gear" if gear != 1.0 else "")
 
 
-def _rated_torque(node: DriveNode, settings: DriveSettings) -> tuple[float, str]:
+def _rated_torque(
+    node: DriveNode, settings: DriveSettings, identity: Identity, torque_nm: float
+) -> tuple[float, str]:
+    """Return the rated torque of the motor and its source; torque_nm: limit at the motor."""
     if settings.rated_torque_nm is not None:
         return settings.rated_torque_nm, "drive.rated_torque_nm"
-    if node.has(od.MOTOR_RATED_TORQUE):
-        return node.read(od.MOTOR_RATED_TORQUE) / 1000.0, "0x6076, in mN·m"
-    raise DriveError("the drive has no 0x6076: give drive.rated_torque_nm")
+    if not node.has(od.MOTOR_RATED_TORQUE):
+        raise DriveError("the drive has no 0x6076: give drive.rated_torque_nm")
+    value = node.read(od.MOTOR_RATED_TORQUE)
+    if settings.rated_torque_unit_nm is not None:
+        unit = settings.rated_torque_unit_nm
+        return value * unit, f"0x6076 = {value}, in drive.rated_torque_unit_nm = {unit:g}"
+    maxon = _rated_by_maxon(node, identity)
+    for unit, name in ((MILLI_NM, "mN·m"), (_MICRO_NM, "µN·m")):
+        if maxon and math.isclose(value * unit, maxon, rel_tol=_SAME):
+            return value * unit, f"0x6076 = {value}, in {name} by 0x3001:01 and 0x3001:05"
+    rated = value / 1000.0
+    if rated and not _LEAST_STEPS * rated / 1000.0 <= torque_nm <= _MOST_RATED * rated:
+        raise DriveError(
+            f"node {node.node_id}, 0x6076 = {value}: in mN·m, one per mille of it would be "
+            f"{rated / 1000.0:g} N·m, which does not suit limits.torque_nm (at the motor "
+            f"{torque_nm:g} N·m); give drive.rated_torque_unit_nm (1e-6 if 0x6076 is in µN·m, "
+            f"1e-3 to confirm mN·m) or drive.rated_torque_nm"
+        )
+    return rated, "0x6076, in mN·m"
+
+
+def _rated_by_maxon(node: DriveNode, identity: Identity) -> float | None:
+    """Return nominal current times torque constant of a drive of maxon [N·m], None of others."""
+    keys = (_MAXON_MOTOR, _MAXON_CURRENT), (_MAXON_MOTOR, _MAXON_CONSTANT)
+    if identity.numbers.get(_VENDOR) != _MAXON or not all(node.has(*key) for key in keys):
+        return None
+    current, constant = (node.read(*key) for key in keys)
+    return current * 1e-3 * constant * 1e-6
 
 
 def _torque_limit(node: DriveNode) -> tuple[float, str]:

@@ -3,6 +3,7 @@
 import math
 import time
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from canwall.bus.can_ids import SYNC
 from canwall.config import Bus as BusSettings
@@ -78,7 +79,7 @@ class DriveSetup:
 
 
 def set_up(
-    node: DriveNode, settings: DriveSettings, bus: BusSettings, real_time: bool
+    node: DriveNode, settings: DriveSettings, bus: BusSettings, torque_nm: float, real_time: bool
 ) -> DriveSetup:
     """Set up torque mode, zero torque, PDOs on the SYNC and watchdog; end in NMT OPERATIONAL.
 
@@ -88,19 +89,82 @@ def set_up(
         node: The drive.
         settings: `[drive]`.
         bus: `[bus]`.
+        torque_nm: `limits.torque_nm`, which the scale of the torque has to suit.
         real_time: Whether SYNCs keep to the clock.
 
     Raises:
-        DriveError: If the drive cannot be set up; names the key for a value that it does not
-            provide.
+        DriveError: If the drive cannot be set up; names the key for each value that it does not
+            provide, and what differs from its object dictionary.
     """
     node.wait_until_present(settings.wait_s)
+    boot_ups = node.boot_ups
     node.command("PRE-OPERATIONAL")
     identity = identify(node)
-    disable(node)
-    notes = list(identity.doubts)
-    _write_parameters(node, settings)
-    scales = read_scales(node, settings)
+    node.refuse_twin()
+    notes: list[str] = []
+    troubles: list[str] = []
+    scales: Scales | None = None
+    prepared: _Prepared | None = None
+    try:
+        disable(node)
+        _write_parameters(node, settings)
+        try:
+            scales = read_scales(node, settings, identity, torque_nm)
+        except DriveError as error:
+            # What else has to be settled is said together with it.
+            troubles.append(str(error))
+        prepared = _prepare(node, settings, bus, real_time, notes)
+    except DriveError as error:
+        troubles.append(str(error))
+    node.refuse_twin()
+    if node.boot_ups > boot_ups:
+        troubles.append(
+            f"node {node.node_id} sent a boot-up message: it restarted during the set-up, or a "
+            f"second drive with its node-ID started"
+        )
+    differences = [*identity.doubts, *_absent(node)]
+    if troubles or scales is None or prepared is None:
+        raise DriveError("; ".join([*troubles, *differences]))
+    node.command("OPERATIONAL")
+    return DriveSetup(
+        scales.units,
+        prepared.sync_cob_id,
+        prepared.tpdo,
+        prepared.rpdo,
+        prepared.watchdog,
+        settings.torque_pdo == "sync",
+        scales.torque_limit_nm,
+        prepared.mode,
+        scales,
+        identity,
+        (*differences, *notes),
+        prepared.sync_counter_overflow,
+    )
+
+
+def _absent(node: DriveNode) -> list[str]:
+    """Return a line about the objects that the dictionary lists and the drive does not have."""
+    if not node.absent:
+        return []
+    listed = ", ".join(node.absent)
+    return [f"{listed} in drive.eds, but not in the drive: file and drive differ; passed over"]
+
+
+class _Prepared(NamedTuple):
+    """What `DriveSetup` says about mode, PDOs, SYNC and watchdog."""
+
+    mode: Mode
+    tpdo: PdoLayout
+    rpdo: PdoLayout
+    watchdog: Watchdog
+    sync_cob_id: int
+    sync_counter_overflow: int
+
+
+def _prepare(
+    node: DriveNode, settings: DriveSettings, bus: BusSettings, real_time: bool, notes: list[str]
+) -> _Prepared:
+    """Set mode, zero torque, SYNC, PDOs and watchdog. Raises DriveError."""
     mode = select_mode(node, settings.mode)
     if mode.number == od.PROFILE_TORQUE and node.has(od.TORQUE_SLOPE):
         set_steepest_slope(node)
@@ -108,32 +172,25 @@ def set_up(
     node.confirm(od.TARGET_TORQUE, 0, 0)
     _set_interpolation_period(node, bus.cycle_s, notes)
     _configure_sync(node, bus.cycle_s, real_time, notes)
-    immediate = settings.torque_pdo == "immediate"
     tpdo = configure_tpdo(node, _MEASURED, _MEASURED_TOO, notes)
-    rpdo = configure_rpdo(node, _COMMANDED, immediate, notes)
+    rpdo = configure_rpdo(node, _COMMANDED, settings.torque_pdo == "immediate", notes)
     rpdo = with_constant(node, rpdo, _COMMANDED)
-    watchdog_s = settings.watchdog_s if real_time else _SIMULATED_WATCHDOG_S
     watchdog = arm(
         node,
         rpdo,
-        max(watchdog_s, _WATCHDOG_CYCLES * bus.cycle_s),
+        max(
+            settings.watchdog_s if real_time else _SIMULATED_WATCHDOG_S,
+            _WATCHDOG_CYCLES * bus.cycle_s,
+        ),
         bus.master_id,
         settings.accept_no_watchdog,
     )
-    sync = node.read(od.SYNC_COB_ID) & 0x7FF if node.has(od.SYNC_COB_ID) else SYNC
-    node.command("OPERATIONAL")
-    return DriveSetup(
-        scales.units,
-        sync,
+    return _Prepared(
+        mode,
         tpdo,
         rpdo,
         watchdog,
-        not immediate,
-        scales.torque_limit_nm,
-        mode,
-        scales,
-        identity,
-        tuple(notes),
+        node.read(od.SYNC_COB_ID) & 0x7FF if node.has(od.SYNC_COB_ID) else SYNC,
         node.read(od.SYNC_COUNTER_OVERFLOW) if node.has(od.SYNC_COUNTER_OVERFLOW) else 0,
     )
 
@@ -173,7 +230,8 @@ def _download_dcf(node: DriveNode) -> None:
             continue
         if variable.index in _COMMANDED or "w" not in variable.access_type:
             continue
-        node.change(variable.index, variable.subindex, variable.value)
+        if node.has(variable.index, variable.subindex):
+            node.change(variable.index, variable.subindex, variable.value)
 
 
 def _configure_sync(node: DriveNode, cycle_s: float, real_time: bool, notes: list[str]) -> None:

@@ -52,9 +52,14 @@ def make_axis(
     Raises:
         DriveError: If the drive cannot be set up.
     """
-    node = DriveNode(link, settings.drive.node_id, dictionary)
+    node = DriveNode(link, settings.drive.node_id, dictionary, settings.drive.sdo_timeout_s)
     try:
-        setup = set_up(node, settings.drive, settings.bus, settings.real_time)
+        setup = set_up(
+            node, settings.drive, settings.bus, settings.limits.torque_nm, settings.real_time
+        )
+    except DriveError as error:
+        kept = node.restore() if settings.drive.restore else []
+        raise DriveError("; not restored: ".join([str(error), *kept])) from None
     except BaseException:
         if settings.drive.restore:
             node.restore()

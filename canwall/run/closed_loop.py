@@ -193,7 +193,7 @@ def cached_servo_scales(settings: Settings) -> ServoScales:
         written = drive.eds.stat().st_mtime_ns
     except OSError:
         written = 0
-    key = (str(drive.eds), written, drive.node_id, str(known))
+    key = (str(drive.eds), written, drive.node_id, drive.rated_torque_unit_nm, str(known))
     return _read_scales(_KeyedSettings(settings, key))
 
 

@@ -26,6 +26,7 @@ class RunResult:
         outcome: How the loop ended.
         notes: What the record lacks.
         remarks: What the drive does not do as configured.
+        not_restored: Changes in the drive that `[drive] restore` could not undo.
     """
 
     folder: RunFolder
@@ -33,6 +34,7 @@ class RunResult:
     outcome: Outcome
     notes: list[str]
     remarks: list[str]
+    not_restored: list[str]
 
 
 def write_result(
@@ -44,6 +46,7 @@ def write_result(
     outcome: Outcome,
     notes: list[str],
     remarks: list[str],
+    not_restored: list[str],
 ) -> RunResult:
     """Write the summary of one axis, and its last cycles if it tripped.
 
@@ -78,7 +81,7 @@ def write_result(
             folder.write_trip(signals, outcome.trip_cycle)
     except RecordError as error:
         notes.append(str(error))  # the trip is told nevertheless
-    return RunResult(folder, summary, outcome, notes, remarks)
+    return RunResult(folder, summary, outcome, notes, remarks, not_restored)
 
 
 def judged(signals: "pa.Table", settings: Settings, units: DriveUnits) -> dict[str, Any]:

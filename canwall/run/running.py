@@ -109,10 +109,11 @@ def run_together(
     results = []
     for axis, folder, of_record in zip(axes, folders, notes, strict=True):
         of_axis = [*of_record, *monitor.notes] if axis is axes[0] else of_record
-        remarks = [*remarks_on(axis.setup, axis.settings), *not_restored.get(axis.name, [])]
+        remarks = remarks_on(axis.setup, axis.settings)
         remarks += outcome.notes if axis is axes[0] else []
+        kept = [f"{axis.name}: not restored: {what}" for what in not_restored.get(axis.name, [])]
         results.append(
-            write_result(axis, exchange, monitor, machine, folder, outcome, of_axis, remarks)
+            write_result(axis, exchange, monitor, machine, folder, outcome, of_axis, remarks, kept)
         )
     report("drawing")
     for recorder, result in zip(recorders, results, strict=True):

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from canwall.config import Drive as DriveSettings
 from canwall.config import Simulation
+from canwall.config.drive import MILLI_NM
 from canwall.simdrive.communication.dictionary import Dictionary
 from canwall.simdrive.communication.memory import UNCONFIGURED, Memory
 from canwall.simdrive.drive import DEFAULT_BITRATE, SimulatedDrive
@@ -35,7 +36,7 @@ def make_drive(
     stored takes precedence.
 
     Args:
-        drive: `[drive]`, for dictionary and node-ID.
+        drive: `[drive]`, for dictionary, node-ID and the unit of 0x6076.
         simulation: `[simulation]`.
         sync_period_s: time from one SYNC to the next.
         bitrate: of the bus, in bit/s.
@@ -51,7 +52,7 @@ def make_drive(
     )
     counts, gear_ratio = _encoder(dictionary, simulation)
     encoder = FaultyEncoder(ServoMotion(simulation, sync_period_s, counts))
-    hardware = _hardware(simulation, counts / (2.0 * math.pi), gear_ratio)
+    hardware = _hardware(simulation, counts / (2.0 * math.pi), gear_ratio, _rated_unit_nm(drive))
     simulated = SimulatedDrive(
         dictionary,
         node_id,
@@ -79,7 +80,7 @@ class ServoScales(NamedTuple):
 
     counts_per_rev: float
     gear_ratio: float
-    rated_torque_mnm: int
+    rated_torque_mnm: float
     torque_limit_per_mille: float
 
 
@@ -96,7 +97,7 @@ def servo_scales(drive: DriveSettings, simulation: Simulation) -> ServoScales:
         for index in TORQUE_LIMITS
         if (index, 0) in dictionary
     ]
-    rated = int(dictionary.number(0x6076, absent=0).value)
+    rated = dictionary.number(0x6076, absent=0).value * (_rated_unit_nm(drive) / MILLI_NM)
     return ServoScales(counts, gear_ratio, rated, float(min(limits, default=math.inf)))
 
 
@@ -106,11 +107,16 @@ def _dictionary(drive: DriveSettings, simulation: Simulation, node_id: int) -> D
     for (index, subindex), value in simulation.objects_by_index.items():
         dictionary.power_on_with(index, subindex, value)
     dictionary.supply(0x1000, 0, _SERVO_DRIVE)
-    dictionary.supply(0x6076, 0, round(1000.0 * simulation.rated_torque_nm))
+    dictionary.supply(0x6076, 0, round(simulation.rated_torque_nm / _rated_unit_nm(drive)))
     dictionary.supply(0x608F, 1, simulation.counts_per_rev)
     for unit in ((0x608F, 2), (0x6091, 1), (0x6091, 2)):
         dictionary.supply(*unit, 1)
     return dictionary
+
+
+def _rated_unit_nm(drive: DriveSettings) -> float:
+    """Return the unit of 0x6076 [N·m]."""
+    return drive.rated_torque_unit_nm or MILLI_NM
 
 
 def _encoder(dictionary: Dictionary, simulation: Simulation) -> tuple[float, float]:
@@ -121,11 +127,14 @@ def _encoder(dictionary: Dictionary, simulation: Simulation) -> tuple[float, flo
     return (simulation.counts_per_rev if resolution == 1.0 else resolution) * gear_ratio, gear_ratio
 
 
-def _hardware(simulation: Simulation, counts_per_rad: float, gear_ratio: float) -> Hardware:
+def _hardware(
+    simulation: Simulation, counts_per_rad: float, gear_ratio: float, rated_torque_unit_nm: float
+) -> Hardware:
     switches, home = simulation.limit_switches_rad, simulation.home_switch_rad
     return Hardware(
         counts_per_rad=counts_per_rad,
         gear_ratio=gear_ratio,
+        rated_torque_unit_nm=rated_torque_unit_nm,
         inertia_kg_m2=simulation.inertia_kg_m2,
         peak_torque_nm=simulation.peak_torque_nm,
         overload_s=simulation.overload_s,

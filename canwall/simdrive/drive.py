@@ -421,8 +421,9 @@ class SimulatedDrive:
         for transmitted in self._sync_tpdos:
             transmitted.sync(self._sync.counter)
 
-    def _leaving(self) -> None:
-        if self._nmt.state is NmtState.OPERATIONAL:
+    def _leaving(self, state: NmtState) -> None:
+        # SDO may have enabled a drive that is not OPERATIONAL; in STOPPED nothing reaches it.
+        if self._nmt.state is NmtState.OPERATIONAL or state is NmtState.STOPPED:
             self._pds.abort_connection(COMMUNICATION, _ABORT_CONNECTION)
 
     def _entered(self) -> None:
@@ -435,9 +436,13 @@ class SimulatedDrive:
         self._route()
 
     def _reset(self, communication_only: bool) -> None:
-        self._pds.disable()
         node_id = self._lss.node_id
-        if node_id != self._node_id:
+        renumbered = node_id != self._node_id
+        if communication_only and not renumbered:
+            self._pds.abort_connection(COMMUNICATION, _ABORT_CONNECTION)
+        else:
+            self._pds.disable()
+        if renumbered:
             # Another node-ID is another power-on, whichever reset it was.
             known = self._dictionary.node_id if node_id == UNCONFIGURED else node_id
             self._build(self._dictionary.renumbered(known), node_id)

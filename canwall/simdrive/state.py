@@ -103,6 +103,7 @@ DRIVE = np.dtype(
         # Torque: to N·m at the shaft, limit switches that are closed (bits of 0x60FD), torque that
         # has held, whether it is less than wanted; I²t.
         ("gear_ratio", "f8"),
+        ("nm_per_rated", "f8"),  # of one per mille, for each unit in 0x6076
         ("torque_sign", "i8"),
         ("inputs", "i8"),
         ("held", "i8"),

@@ -39,7 +39,7 @@ def take(drives: NDArray[np.void], can_id: int, length: int, data: int) -> int:
     drive: Record = drives[0]
     if drive.steady:
         rpdo = drive.rpdos[drive.sync_rpdo]
-        if can_id == rpdo.can_id and length >= rpdo.length:
+        if can_id == rpdo.can_id and length == rpdo.length:
             restart_event_timer(drives, drive.sync_rpdo)
             keep_until_sync(drives, drive.sync_rpdo, data)
             return 0

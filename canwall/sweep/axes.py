@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from canwall.config import ConfigError, Settings, with_overrides
+from canwall.config.drive import MILLI_NM
 from canwall.cycle import with_law
 from canwall.errors import InputError
 from canwall.run.closed_loop import cached_servo_scales, loop_delay
@@ -230,10 +231,9 @@ def _with_torque_step(settings: Settings, step: Value) -> Settings:
     scales = cached_servo_scales(settings)
     rated = round(1e6 * float(step))
     if rated < 1 or abs(rated * 1e-6 - float(step)) > 1e-12:
-        raise ConfigError(
-            f"sweep axis torque_step: {step} N·m: 0x6076 is in mN·m, a step in whole µN·m"
-        )
+        raise ConfigError(f"sweep axis torque_step: {step} N·m: give it in whole µN·m")
     per_mille = min(round(scales.torque_limit_per_mille * scales.rated_torque_mnm / rated), 32767)
+    rated = round(rated * MILLI_NM / (settings.drive.rated_torque_unit_nm or MILLI_NM))
     peak = settings.simulation.peak_torque_nm or 3e-3 * scales.rated_torque_mnm
     objects = {"0x6076": rated} | {f"0x{index:04X}": per_mille for index in TORQUE_LIMITS}
     return _with_objects(settings, objects, peak_torque_nm=peak)

@@ -360,7 +360,7 @@ def test_torque_is_zero_in_the_cycle_of_the_emergency(make_rig: RigFactory) -> N
 @pytest.mark.parametrize(
     ("state", "text"),
     [
-        (0x00, "the drive restarted"),
+        (0x00, "the drive restarted, or a second one with its node-ID started"),
         (0x04, "the drive is in NMT STOPPED"),
         (0xFF, "the drive is in NMT PRE-OPERATIONAL"),
     ],

@@ -9,6 +9,7 @@ from rig import Loop, Rig, RigFactory
 
 from canwall import config
 from canwall.config import Settings
+from canwall.drive import DriveError, set_up
 
 EDS = Path(__file__).parents[3] / "shared" / "vendor-eds"
 DRIVES = config.shipped("config/drives/epos4.toml").parent
@@ -146,6 +147,18 @@ def test_run(drive: Drive, tmp_path: Path) -> None:
     assert [strike["law"] for strike in strikes] == ["standard", "half_sample"] * 2
     assert [strike["chatter"] for strike in strikes] == [True, False, True, False]
     assert [strikes[i]["contacts"] for i in (1, 3)] == [1, 1]
+
+
+def test_maxon_counts_the_rated_torque_in_micro(make_rig: RigFactory) -> None:
+    drive = FOUND[0]
+    if not (EDS / drive.eds).is_file():
+        pytest.skip(f"{EDS} has no {drive.eds}")
+    settings = settings_of(drive)
+    rig = make_rig(settings)
+    assert rig.node.read(0x6076) == 637_000
+    unsaid = settings.drive.model_copy(update={"rated_torque_unit_nm": None})
+    with pytest.raises(DriveError, match=r"give drive\.rated_torque_unit_nm \(1e-6 if"):
+        set_up(rig.node, unsaid, settings.bus, settings.limits.torque_nm, False)
 
 
 @pytest.mark.parametrize("name", ["elmo", "nanotec"])

@@ -26,7 +26,7 @@ from commands import (
     torque_is_on,
     wait_for,
 )
-from rig import RPDO1, SDO_ANSWER, SDO_REQUEST, SYNC, TPDO1, settings_with
+from rig import RPDO1, SDO_ANSWER, SDO_REQUEST, SYNC, TPDO1, eds_with, settings_with
 
 import canwall.run.buses
 import canwall.run.running
@@ -373,6 +373,18 @@ def test_trip_is_the_outcome(tmp_path: Path) -> None:
     record = Record(tmp_path / "run")
     assert record.summary["trips"] == [line.removeprefix("canwall: ")]
     assert struct.unpack("<Hh", record.cycles[-1][1]) == (0x00, 0)
+
+
+@pytest.mark.slow
+def test_drive_that_is_not_restored_is_a_failure(tmp_path: Path) -> None:
+    # The drive begins with an inhibit time that nobody may write.
+    odd = {("1800sub3", "DefaultValue"): "20\nHighLimit=10"}
+    eds = eds_with(tmp_path / "odd.eds", odd)
+    done = command(
+        "run", "--eds", eds, "--restore", "--duration", "0.1", "--output", tmp_path / "run"
+    )
+    assert done.returncode == 1
+    assert "node 5: not restored: node 5: writing 0x14 to 0x1800:03 failed" in done.stderr
 
 
 @pytest.mark.slow

@@ -116,7 +116,7 @@ SEQUENCES: list[list[Data]] = [
         (SDO_REQUEST, b"\xa2\x03\x03".ljust(8, b"\0")),
         (SDO_REQUEST, b"\xa1".ljust(8, b"\0")),
     ],
-    [sdo(0x21, 0x2100, 0, 14), *((SDO_REQUEST, bytes([n << 4]) + bytes(7)) for n in (0, 1, 0))],
+    [sdo(0x21, 0x2100, 0, 21), *((SDO_REQUEST, bytes([n << 4]) + bytes(7)) for n in (0, 1, 0))],
     [lss(4, 1), lss(0x11, 9), lss(0x17), lss(4, 0), (0x000, bytes([130, 0]))],
     [lss(4, 1), lss(0x11, 255), (0x000, bytes([129, 0])), lss(0x51, 0, 0, 0, 0, 0x80)],
     [lss(4, 1), lss(0x15, 20, 0), lss(0x5E)],

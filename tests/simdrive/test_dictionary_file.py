@@ -85,7 +85,7 @@ def edited(directory: Path, old: str, new: str) -> Path:
             "object 0x6071:00 target torque: data type is not 0x0003",
         ),
         ("[1400sub1]", "[1400sub9]", "object 0x1400:01 missing"),
-        ("DefaultValue=0x60410010", "DefaultValue=0x60990010", "object 0x1A00:00 maps"),
+        ("DefaultValue=0x60410010", "DefaultValue=0x60410009", "object 0x1A00:00 maps"),
         (
             "[1017]\nParameterName=Producer heartbeat time\nObjectType=0x7\nDataType=0x0006",
             "[1017]\nParameterName=Producer heartbeat time\nObjectType=0x7\nDataType=0x0009",

@@ -79,6 +79,12 @@ def state_name(statusword: int) -> str:
     return str(name)
 
 
+def set_option(bench: BusBench, option: str) -> None:
+    """Write an object, e.g. "6007=2"."""
+    index, value = option.split("=")
+    bench.write(int(index, 16), int(value))
+
+
 def happen(bench: BusBench, events: str, braking: str = "-") -> list[Moment]:
     """Let the events come; return the braking SYNC by SYNC, if there was one."""
     moments: list[Moment] = []
@@ -94,6 +100,8 @@ def happen(bench: BusBench, events: str, braking: str = "-") -> list[Moment]:
         elif event in SUPPLIES:
             name, active = SUPPLIES[event]
             getattr(bench.drive._pds, name)(active)
+        elif "=" in event:
+            set_option(bench, event)
         elif event.startswith("mode"):
             bench.write(0x6060, int(event.removeprefix("mode")))
         elif event.startswith("t"):
@@ -168,8 +176,7 @@ def test_case(bus_bench: BusBench, case: Case) -> None:
     bench.write(0x6060, 10)
     bench.nmt(START)
     for option in case.options.strip("-").split():
-        index, value = option.split("=")
-        bench.write(int(index, 16), int(value))
+        set_option(bench, option)
     happen(bench, WAY[case.before])
     assert state_name(bench.read(0x6041)) == case.before
     if case.braking != "-" or float(case.speed):

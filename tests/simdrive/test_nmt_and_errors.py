@@ -72,6 +72,7 @@ def test_reset_communication_reloads_0x1000_to_0x1fff(bench: Bench) -> None:
     bench.write(0x1005, 0, 0x1F1, 4)
     bench.write(0x1402, 5, 20, 2)
     bench.write(0x6072, 0, 1500, 2)
+    bench.write(0x6007, 0, 2, 2)
     assert bench.nmt(RESET_COMMUNICATION) == [(HEARTBEAT, b"\x00")]
     assert bench.read(0x1005) == 0x80
     assert bench.read(0x1402, 5) == 0

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 from canopen import SdoAbortedError
+from rig import eds_with
 from simdrive_bench import (
     ACTUAL_TORQUE,
     CONTROLWORD,
-    EDS,
     NO_RTR,
     NOT_VALID,
     POSITION,
@@ -87,6 +87,11 @@ REFUSED: dict[str, tuple[str, Callable[[Bench], None]]] = {
     "29-bit identifier, not valid": (INVALID_VALUE, write(0x1403, 1, 0xA0000505, 4)),
     "reserved bits": (INVALID_VALUE, write(0x1803, 1, 0x80001505, 4)),
     "identifier of the SDO": (INVALID_VALUE, write(0x1403, 1, 0x605, 4)),
+    "identifier of SYNC for a TPDO": (INVALID_VALUE, write(0x1803, 1, NO_RTR | 0x080, 4)),
+    "identifier of SYNC for an RPDO": (INVALID_VALUE, write(0x1403, 1, 0x080, 4)),
+    "identifier of the own EMCY": (INVALID_VALUE, write(0x1803, 1, NO_RTR | 0x085, 4)),
+    "identifier of TIME": (INVALID_VALUE, write(0x1803, 1, NO_RTR | 0x100, 4)),
+    "identifier of a heartbeat": (INVALID_VALUE, write(0x1803, 1, NO_RTR | 0x705, 4)),
     "identifier of NMT": (INVALID_VALUE, write(0x1403, 1, 0x000, 4)),
     "transmission type 241": (INVALID_VALUE, write(0x1800, 2, 241, 1)),
     "transmission type 251": (INVALID_VALUE, write(0x1800, 2, 251, 1)),
@@ -131,13 +136,53 @@ def test_refused_write_leaves_the_pdo_as_it_is(bench: Bench) -> None:
     assert bench.nmt(START)[0] == (TPDO[1], b"\x00\x00")
 
 
-def test_mapping_of_the_eds_is_checked_when_the_pdo_becomes_valid(tmp_path: Path) -> None:
-    path = tmp_path / "edited.eds"
-    path.write_text(EDS.read_text().replace("DefaultValue=0x60770010", "DefaultValue=0x60990010"))
-    bench = Bench(path)
-    with pytest.raises(SdoAbortedError, match=NO_OBJECT):
-        bench.write(0x1803, 1, NO_RTR | TPDO[4], 4)
-    assert bench.read(0x1803, 1) & NOT_VALID
+def test_sync_elsewhere_takes_its_identifier(bench: Bench) -> None:
+    bench.write(0x1005, 0, 0x1F1, 4)
+    for cob_id in (0x1F1, 0x080):  # others may still produce the usual one
+        with pytest.raises(SdoAbortedError, match=INVALID_VALUE):
+            bench.write(0x1803, 1, NO_RTR | cob_id, 4)
+
+
+@pytest.mark.parametrize("unserved", [0x60990010, 0x10000020, 0x60410110])
+def test_mapping_of_the_file_that_is_not_served_is_a_gap(tmp_path: Path, unserved: int) -> None:
+    """As Elmo's 0x1601, which maps 0x2013: nobody has to use it, and it can be put back."""
+    bench = Bench(
+        eds_with(tmp_path / "gap.eds", {("1A00sub1", "DefaultValue"): f"{unserved:#010x}"})
+    )
+    assert bench.nmt(START)[0] == (TPDO[1], bytes((unserved & 0xFF) // 8))
+    bench.configure_pdo(0x1800, NO_RTR | TPDO[1], 255, [STATUSWORD])
+    bench.configure_pdo(0x1800, NO_RTR | TPDO[1], 255, [unserved])
+    assert bench.read(0x1A00, 1) == unserved
+    with pytest.raises(SdoAbortedError):  # another PDO does not have it from the file
+        bench.configure_pdo(0x1803, NO_RTR | TPDO[4], 255, [unserved])
+
+
+def test_empty_pdo_that_begins_valid_may_be_so_again(tmp_path: Path) -> None:
+    """As Elmo's Whistle has it."""
+    bench = Bench(eds_with(tmp_path / "empty.eds", {("1600sub0", "DefaultValue"): "0"}))
+    before = bench.read(0x1400, 1)
+    assert not before & NOT_VALID
+    assert bench.read(0x1600, 0) == 0
+    bench.configure_pdo(0x1400, RPDO[1], 1, [CONTROLWORD])
+    bench.write(0x1400, 1, NOT_VALID | RPDO[1], 4)
+    bench.write(0x1600, 0, 0, 1)
+    bench.write(0x1400, 1, before, 4)
+    bench.nmt(START)
+    bench.give(RPDO[1], b"\x06\x00")
+    assert bench.read(0x6040) == 0
+
+
+def test_mapping_changes_while_valid_if_the_identifier_is_read_only(tmp_path: Path) -> None:
+    """As Elmo's SimplIQ has it."""
+    bench = Bench(eds_with(tmp_path / "fixed.eds", {("1800sub1", "AccessType"): "ro"}))
+    bench.nmt(START)
+    bench.write(0x1A00, 0, 0, 1)
+    assert TPDO[1] not in [can_id for can_id, _ in bench.sync()]
+    bench.write(0x1A00, 1, POSITION, 4)
+    bench.write(0x1A00, 0, 1, 1)
+    bench.write(0x1800, 2, 1, 1)
+    frames = bench.sync()
+    assert (TPDO[1], struct.pack("<i", bench.motion.position)) in frames
 
 
 def test_identifier_may_change_with_the_write_that_invalidates(bench: Bench) -> None:

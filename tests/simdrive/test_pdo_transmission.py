@@ -125,6 +125,22 @@ def test_power_on_configuration(bench: Bench) -> None:
     assert bench.sent[-3][1] == b"\x33\x02"
 
 
+def test_rpdo_too_long_counts_and_is_reported_once(quiet: Bench) -> None:
+    quiet.nmt(START)
+    long = b"\x06\x00\x2c\x01\xff"
+    frames = quiet.give(RPDO[3], long)
+    assert frames[0] == (EMCY, bytes.fromhex("2082 11 0216 00 0000"))
+    assert quiet.read(0x6071) == 300
+    assert quiet.read(0x6041) == 0x0231
+    assert EMCY not in dict(quiet.give(RPDO[3], long))
+    assert quiet.give(RPDO[3], long[:3])[0] == (EMCY, bytes.fromhex("1082 11 0216 00 0000"))
+    assert [data[:2] for can_id, data in quiet.give(RPDO[3], long[:4]) if can_id == EMCY] == [
+        b"\0\0",
+        b"\0\0",
+    ]
+    assert quiet.read(0x1001) == 0
+
+
 def test_rpdo_too_short_is_ignored_and_reported_once(quiet: Bench) -> None:
     quiet.nmt(START)
     short = b"\x06\x00\x2c"
@@ -137,14 +153,6 @@ def test_rpdo_too_short_is_ignored_and_reported_once(quiet: Bench) -> None:
         bytes.fromhex("0000 00 0216 00 0000"),
     )
     assert quiet.read(0x603F) == 0
-
-
-def test_rpdo_too_long_counts_with_its_first_bytes(quiet: Bench) -> None:
-    quiet.nmt(START)
-    quiet.give(RPDO[3], b"\x06\x00\x2c\x01\xff\xff\xff\xff")
-    assert quiet.read(0x6041) == 0x0231
-    assert quiet.read(0x6071) == 300
-    assert quiet.emergencies() == []
 
 
 @pytest.mark.parametrize("kind", [1, 255])

@@ -98,7 +98,8 @@ def test_a_doubled_segment_counts_once(bench: Bench) -> None:
     ("head", "size", "last", "code"),
     [
         (0xC6, 7, end(DATA[:7]), None),
-        (0xC6, 8, end(DATA[:7]), "06070010"),
+        (0xC6, 8, end(DATA[:7]), "06070013"),
+        (0xC6, 6, end(DATA[:7]), "06070012"),
         (0xC6, 7, frame(0xC1, 1, 2), "05040004"),
         (0xC2, 7, frame(0xC1, 1, 2), None),
     ],

@@ -251,6 +251,11 @@ def download_more_than_indicated(bench: Bench) -> None:
     bench.sdo(segment(0x01, b"seven b"))
 
 
+def download_more_than_indicated_and_go_on(bench: Bench) -> None:
+    bench.sdo(initiate(0x21, 0x2000, 0, struct.pack("<L", 5)))
+    bench.sdo(segment(0x00, b"seven b"))
+
+
 def download_less_than_indicated(bench: Bench) -> None:
     bench.sdo(initiate(0x21, 0x2000, 0, struct.pack("<L", 9)))
     bench.sdo(segment(0x01, b"seven b"))
@@ -327,8 +332,9 @@ ABORTS: list[tuple[AbortCode, Callable[[Bench], object]]] = [
     (AbortCode.NOT_MAPPABLE, map_control_into_a_tpdo),
     (AbortCode.PDO_LENGTH, map_too_much),
     (AbortCode.INCOMPATIBLE_PARAMETER, watch_one_node_twice),
-    (AbortCode.LENGTH, download_more_than_indicated),
-    (AbortCode.LENGTH, download_less_than_indicated),
+    (AbortCode.TOO_LONG, download_more_than_indicated),
+    (AbortCode.TOO_LONG, download_more_than_indicated_and_go_on),
+    (AbortCode.TOO_SHORT, download_less_than_indicated),
     (AbortCode.TOO_LONG, lambda bench: bench.write(0x1017, 0, 0, 4)),
     (AbortCode.TOO_LONG, lambda bench: download(bench, 0x1017, bytes(8), 8)),
     (AbortCode.TOO_LONG, lambda bench: download(bench, 0x1017, bytes(8))),

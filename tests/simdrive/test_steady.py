@@ -53,7 +53,7 @@ def frames_of(drive: FaultyDrive, action: str, draw: random.Random) -> list[Fram
             return drive.process(RPDO[3], struct.pack("<Hh", 0x0F, draw.randint(-2500, 2500)))
         case "rated torque":
             data = struct.pack("<Hh", 0x0F, draw.randint(-900, 900))
-            return drive.process(RPDO[3], data + bytes(draw.randint(0, 4)))
+            return drive.process(RPDO[3], data)
         case "controlword":
             return drive.process(RPDO[3], struct.pack("<Hh", draw.choice((6, 7, 15, 0x10F)), 500))
         case "recover":
@@ -71,6 +71,8 @@ def frames_of(drive: FaultyDrive, action: str, draw: random.Random) -> list[Fram
         case "write":
             index, value = draw.choice(((0x6072, 700), (0x6072, 3000), (0x6071, 40), (0x60E0, 800)))
             return drive.process(SDO_REQUEST, struct.pack("<BHBhxx", 0x2B, index, 0, value))
+        case "long":
+            return drive.process(RPDO[3], struct.pack("<Hhx", 0x0F, draw.randint(-900, 900)))
         case "short":
             return drive.process(RPDO[3], b"\x0f")
         case "counted":
@@ -90,6 +92,7 @@ ACTIONS = {
     "controlword": 3,
     "recover": 12,
     "short": 1,
+    "long": 1,
     "counted": 1,
     "foreign": 10,
 }

@@ -144,6 +144,7 @@ def test_four_pdos_each_way_in_the_order_of_cia_301(
         (0x1800 + number - 1, NO_RTR | TPDO[number], STATUSWORD),
     ):
         mapping = communication + 0x200
+        begins_empty = not (bench.read(communication, 1) & NOT_VALID or bench.read(mapping, 0))
         configure(bench, communication, cob_id, [mapped])
         for index, subindex, value, size in (
             (mapping, 0, 0, 1),  # while it is valid
@@ -156,6 +157,8 @@ def test_four_pdos_each_way_in_the_order_of_cia_301(
         with pytest.raises(SdoAbortedError, match="08000022"):
             bench.write(mapping, 1, mapped, 4)  # while the number of entries is not 0
         bench.write(mapping, 0, 0, 1)
+        if begins_empty:  # so it may be so again
+            continue
         with pytest.raises(SdoAbortedError, match="08000022"):
             bench.write(communication, 1, cob_id, 4)  # valid with nothing in it
         assert bench.read(communication, 1) == NOT_VALID | cob_id

@@ -1,5 +1,7 @@
 """COB-ID entries (CiA 301, 7.5.2.5, 7.5.2.17, 7.5.2.35): which identifiers may stand in one."""
 
+from collections.abc import Container
+
 from canwall.simdrive.communication.abort import AbortCode, AccessError
 
 CAN_ID = 0x7FF
@@ -19,14 +21,18 @@ _RESTRICTED = (
 )
 
 
-def check_can_id(cob_id: int) -> None:
+def check_can_id(cob_id: int, taken: Container[int] = ()) -> None:
     """Refuse 29-bit identifiers and, in a valid COB-ID, restricted ones.
+
+    Args:
+        cob_id: to be written.
+        taken: CAN-IDs of other services of this device, which are restricted as well.
 
     Raises:
         AccessError: INVALID_VALUE.
     """
     can_id = cob_id & CAN_ID
-    restricted = not cob_id & NOT_VALID and any(can_id in ids for ids in _RESTRICTED)
+    restricted = not cob_id & NOT_VALID and any(can_id in ids for ids in (*_RESTRICTED, taken))
     if cob_id & EXTENDED or restricted:
         raise AccessError(AbortCode.INVALID_VALUE)
 

@@ -28,7 +28,7 @@ class NmtSlave:
     def __init__(
         self,
         node_id: int,
-        leaving: Callable[[], None],
+        leaving: Callable[[NmtState], None],
         entered: Callable[[], None],
         reset: Callable[[bool], None],
     ) -> None:
@@ -36,7 +36,7 @@ class NmtSlave:
 
         Args:
             node_id: own node-ID.
-            leaving: called before the state changes.
+            leaving: called with the new state before the state changes.
             entered: called after the state has changed.
             reset: called for a reset, with True if it is one of the communication only.
         """
@@ -59,6 +59,6 @@ class NmtSlave:
     def enter(self, state: NmtState) -> None:
         """Go to a state, unless the node is in it."""
         if state is not self.state:
-            self._leaving()
+            self._leaving(state)
             self.state = state
             self._entered()

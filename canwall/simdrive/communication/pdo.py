@@ -1,12 +1,18 @@
 """Receive and transmit PDOs: communication and mapping parameter (CiA 301, 7.5.2.35 to 7.5.2.38).
 
 The order that CiA 301 prescribes is kept: COB-ID invalid (bit 31), number of mapped objects 0,
-mapping entries, number of mapped objects, COB-ID valid. Anything else gets DEVICE_STATE.
+mapping entries, number of mapped objects, COB-ID valid. Anything else gets DEVICE_STATE, except
+that power-on values may be written back, and that the mapping of a PDO whose COB-ID cannot be
+written changes while it is valid.
+
+The file of a drive may map objects by default that are not served here. They are gaps: zeros in a
+TPDO, ignored in an RPDO.
 """
 
 from collections.abc import Callable
 from struct import Struct
 
+from canwall.bus.can_ids import EMCY, SYNC, TIME
 from canwall.simdrive.communication.abort import AbortCode, AccessError
 from canwall.simdrive.communication.cob_id import (
     CAN_ID,
@@ -70,17 +76,23 @@ class Pdo:
         remote = (SYNCHRONOUS_REMOTE, EVENT_DRIVEN_REMOTE) if self.transmit else ()
         self._type.allow(_TRANSMISSION_TYPES.union(remote))
         self._event_time = dictionary.number(index, 5, absent=0)
+        self._others = (
+            dictionary.number(0x1005, absent=SYNC),
+            dictionary.number(0x1012, absent=TIME),
+            dictionary.number(0x1014, absent=EMCY + dictionary.node_id),
+        )
         self._count = dictionary.number(mapping, 0, absent=0)
         self._mapping = [
             dictionary.number(mapping, subindex, absent=0)
             for subindex in range(1, 65)
             if (mapping, subindex) in dictionary
         ]
+        self._unserved = {entry.default for entry in self._mapping if self._is_unserved(entry)}
         self._cob_id.check = self._check_cob_id
         self._count.check = self._check_count
         for entry in self._mapping:
             entry.check = self._check_mapping
-        for entry in (self._cob_id, self._type, self._event_time):
+        for entry in (self._cob_id, self._type, self._event_time, self._count):
             entry.react = self._react
         try:
             self.configure()
@@ -149,8 +161,10 @@ class Pdo:
         return objects
 
     def _resolve(self, mapped: int) -> tuple[str, Entry | None]:
-        """Return format and entry of a mapping value (index, sub-index, bits); None: dummy."""
+        """Return format and entry of a mapping value (index, sub-index, bits); None: a gap."""
         index, subindex, bits = mapped >> 16, mapped >> 8 & 0xFF, mapped & 0xFF
+        if mapped in self._unserved:
+            return f"{bits // 8}x", None
         dummy_size = self._dictionary.dummies.get(index)
         if dummy_size is not None and subindex == 0 and not self.transmit:
             if bits != 8 * dummy_size:
@@ -163,11 +177,21 @@ class Pdo:
             raise AccessError(AbortCode.NOT_MAPPABLE)
         return form, entry
 
+    def _is_unserved(self, entry: Entry) -> bool:
+        """Return True for a mapping of the file, in whole bytes, that cannot be served."""
+        self._unserved = set()
+        try:
+            self._resolve(entry.default)
+        except AccessError:
+            return bool(entry.default and not entry.default & 7)
+        return False
+
     def _check_cob_id(self, value: int) -> None:
-        check_can_id(value)
+        check_can_id(value, {SYNC, *(other.value & CAN_ID for other in self._others)})
         check_unchanged_while_valid(self._cob_id.value, value)
         if not value & NOT_VALID:
-            if not self._count.value:
+            begins_empty = not (self._cob_id.default & NOT_VALID or self._count.default)
+            if not self._count.value and not begins_empty:
                 raise AccessError(AbortCode.DEVICE_STATE)
             self._compile(self._count.value)
 
@@ -183,7 +207,7 @@ class Pdo:
             self._resolve(value)
 
     def _check_not_valid(self) -> None:
-        if self.valid:
+        if self.valid and "w" in self._cob_id.access:
             raise AccessError(AbortCode.DEVICE_STATE)
 
     def _react(self, _: int) -> None:

@@ -8,7 +8,12 @@ from numpy.typing import NDArray
 from canwall.compiled import Record, compiled, data_to_number, number_to_data
 from canwall.simdrive.communication.abort import AccessError
 from canwall.simdrive.communication.dictionary import Dictionary, Key
-from canwall.simdrive.communication.emcy import PDO_TOO_SHORT, RPDO_TIMEOUT, EmergencyProducer
+from canwall.simdrive.communication.emcy import (
+    PDO_TOO_LONG,
+    PDO_TOO_SHORT,
+    RPDO_TIMEOUT,
+    EmergencyProducer,
+)
 from canwall.simdrive.communication.frame import NS_PER_MS
 from canwall.simdrive.communication.pdo import MAPPING_OFFSET, MAX_BYTES, Pdo
 from canwall.simdrive.state import NEVER, DriveRecord
@@ -60,7 +65,7 @@ class Rpdo(Pdo):
             dictionary: has the entries.
             index: of the communication parameter.
             state: of the drive.
-            emcy: reports PDOs that are too short, and the end of a time-out.
+            emcy: reports PDOs that are too short or too long, and the end of a time-out.
             changed: called when the PDO became active or inactive, or moved.
             timed_out: called with error code and (index, sub-index) when the deadline passes.
 
@@ -93,10 +98,14 @@ class Rpdo(Pdo):
         self._pdo.deadline_ns = NEVER
 
     def receive(self, data: bytes) -> None:
-        """Take a frame; of one that is too long the first bytes count."""
+        """Take a frame; one that is too long is reported, and its first bytes count."""
         if len(data) < self._struct.size:
             self._emcy.occurred(PDO_TOO_SHORT, self._length_source)
             return
+        if len(data) > self._struct.size:
+            self._emcy.occurred(PDO_TOO_LONG, self._length_source)
+        else:
+            self._emcy.gone(PDO_TOO_LONG, self._length_source)
         if self._emcy.present:
             self._emcy.gone(PDO_TOO_SHORT, self._length_source)
             self._emcy.gone(RPDO_TIMEOUT, self._timer_source)

@@ -201,10 +201,13 @@ class SdoServer:
         head = data[0]
         _check_toggle(data, download.toggle)
         download.data += data[1 : 1 + _SEGMENT_SIZE - (head >> 1 & 7)]
-        _check_memory(len(download.data))
+        received = len(download.data)
+        _check_memory(received)
+        if download.size is not None and received > download.size:
+            raise AccessError(AbortCode.TOO_LONG)
         if head & _LAST_SEGMENT:
-            if download.size is not None and len(download.data) != download.size:
-                raise AccessError(AbortCode.LENGTH)
+            if download.size is not None and received < download.size:
+                raise AccessError(AbortCode.TOO_SHORT)
             self._transfer = None
             download.entry.download(bytes(download.data))
         response = _DOWNLOAD_SEGMENT_RESPONSE | download.toggle

@@ -69,14 +69,15 @@ class BlockDownload:
         """Write what was received.
 
         Raises:
-            AccessError: CRC, LENGTH, OUT_OF_MEMORY, or what the entry refuses.
+            AccessError: CRC, TOO_LONG, TOO_SHORT, OUT_OF_MEMORY, or what the entry refuses.
         """
         head, crc = _END.unpack(data)
         del self._data[len(self._data) - (head >> 2 & 7) :]
         if len(self._data) > self._max_size:
             raise AccessError(AbortCode.OUT_OF_MEMORY)
         if self._size is not None and len(self._data) != self._size:
-            raise AccessError(AbortCode.LENGTH)
+            longer = len(self._data) > self._size
+            raise AccessError(AbortCode.TOO_LONG if longer else AbortCode.TOO_SHORT)
         if self._with_crc and crc_hqx(self._data, 0) != crc:
             raise AccessError(AbortCode.CRC)
         self.entry.download(bytes(self._data))

@@ -11,6 +11,7 @@ class Hardware:
     Attributes:
         counts_per_rad: encoder increments per radian of the shaft with the handle.
         gear_ratio: revolutions of the motor per revolution of that shaft (0x6091).
+        rated_torque_unit_nm: unit of 0x6076 [N·m].
         inertia_kg_m2: of drive and handle at that shaft; the velocity controller is tuned to it.
         peak_torque_nm: motor torque that the current limit allows; None: three times the rated one.
         overload_s: time that the I²t monitoring allows the peak torque [s].
@@ -22,6 +23,7 @@ class Hardware:
 
     counts_per_rad: float = 131072 / (2.0 * math.pi)
     gear_ratio: float = 1.0
+    rated_torque_unit_nm: float = 1e-3
     inertia_kg_m2: float = 1.0e-4
     peak_torque_nm: float | None = None
     overload_s: float = 3.0

@@ -21,8 +21,6 @@ from canwall.simdrive.state import NEGATIVE_LIMIT as NEGATIVE_TORQUE_LIMIT
 from canwall.simdrive.state import POSITIVE_LIMIT as POSITIVE_TORQUE_LIMIT
 
 _NO_LIMIT = 1 << 31
-_PER_MILLE_MILLI = 1e-6
-"""Per mille of a rated torque in mN m, to N m."""
 _RATED = 1000
 _PEAK = 3000.0
 """Peak torque in per mille of the rated one, where the hardware does not say."""
@@ -32,7 +30,7 @@ _PEAK = 3000.0
 def nm_per_mille(drives: NDArray[np.void]) -> float:
     """Return one unit of torque on the bus, at the shaft and in the motor's direction [N·m]."""
     drive: Record = drives[0]
-    scale = drive.values[RATED_TORQUE] * _PER_MILLE_MILLI * drive.gear_ratio
+    scale = drive.values[RATED_TORQUE] * drive.nm_per_rated * drive.gear_ratio
     return scale * drive.torque_sign
 
 
@@ -93,11 +91,12 @@ class TorquePath:
         self._demand = number(0x6074, absent=0)
         self._actual = number(0x6077, absent=0)
         self._current = number(0x6078, absent=0)
-        rated_nm = number(0x6076, absent=0).value * 1e-3
+        rated_nm = number(0x6076, absent=0).value * hardware.rated_torque_unit_nm
         peak = hardware.peak_torque_nm
         per_mille = 1e3 * peak / rated_nm if peak and rated_nm else _PEAK
         self.overload = Overload(state, per_mille, hardware.overload_s)
         self._state.gear_ratio = hardware.gear_ratio
+        self._state.nm_per_rated = hardware.rated_torque_unit_nm / 1e3
         self._state.held = 0
         self._state.limited = False
 
