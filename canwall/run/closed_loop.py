@@ -77,6 +77,7 @@ class LoopRecords(NamedTuple):
         whole: Whole periods of the delay D.
         share: Rest of the delay D [periods].
         enabling: Cycles before the wall is rendered.
+        lost: True for each cycle whose TPDO is lost, shape (cycles,).
     """
 
     cycle: NDArray[np.void]
@@ -91,9 +92,15 @@ class LoopRecords(NamedTuple):
     whole: int
     share: float
     enabling: int
+    lost: NDArray[np.bool_]
 
 
-def simulate(settings: Settings, cycles: int, enabling: int = ENABLING_CYCLES) -> SimulatedRun:
+def simulate(
+    settings: Settings,
+    cycles: int,
+    enabling: int = ENABLING_CYCLES,
+    lost: NDArray[np.bool_] | None = None,
+) -> SimulatedRun:
     """Render the wall of a configuration in memory.
 
     The delay of the loop is one period for a synchronous RPDO, none for one that acts on reception,
@@ -103,11 +110,12 @@ def simulate(settings: Settings, cycles: int, enabling: int = ENABLING_CYCLES) -
         settings: Configuration with `[simulation]`, without changes of the wall.
         cycles: Number of SYNCs.
         enabling: Number of SYNCs without torque at the start.
+        lost: True for each SYNC whose TPDO is lost, shape (cycles,). Default: none is.
 
     Raises:
         ConfigError: If only a run can render the configuration.
     """
-    loop = ClosedLoop(settings, cycles, enabling)
+    loop = ClosedLoop(settings, cycles, enabling, lost)
     records, rows = loop.records(), np.zeros(cycles, ROW)
     done = simulate_loop(records, rows, np.empty((3, cycles)))
     return SimulatedRun(rows[:done], loop.units, Trip(int(records.cycle["trip"][0])))
@@ -116,7 +124,13 @@ def simulate(settings: Settings, cycles: int, enabling: int = ENABLING_CYCLES) -
 class ClosedLoop:
     """Cycle, servo and hand of a configuration, to be simulated with one wall or several."""
 
-    def __init__(self, settings: Settings, cycles: int, enabling: int = ENABLING_CYCLES) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        cycles: int,
+        enabling: int = ENABLING_CYCLES,
+        lost: NDArray[np.bool_] | None = None,
+    ) -> None:
         """Prepare a loop; arguments and errors are those of `simulate`."""
         simulation = settings.simulation
         if simulation is None:
@@ -143,6 +157,7 @@ class ClosedLoop:
         self._whole = math.floor(delay)
         self._share = delay - self._whole
         self._enabling = enabling
+        self._lost = np.zeros(cycles, np.bool_) if lost is None else lost
 
     def records(self) -> LoopRecords:
         """Return records for a thread of its own; several may simulate the loop at a time."""
@@ -160,6 +175,7 @@ class ClosedLoop:
             self._whole,
             self._share,
             self._enabling,
+            self._lost,
         )
 
 
@@ -276,7 +292,7 @@ def _run_cycles(loop: LoopRecords, rows: NDArray[np.void], signals: Array) -> in
         # The drive shows the torque that acts at the SYNC, not the one that is still on its way.
         shown = sent[whole] if share > 0.0 or whole == 0 else sent[whole - 1]
         data = (counts & 0xFFFFFFFF) | (_ENABLED << 32) | ((shown & 0xFFFF) << 48)
-        step(cycles, rows[at : at + 1], data, True)
+        step(cycles, rows[at : at + 1], data, not loop.lost[j])
         row: Record = rows[at]
         signals[0, j], signals[1, j], signals[2, j] = row.y, row.force_applied, row.torque_cmd
         at = at + 1 if at + 1 < len(rows) else 0
