@@ -16,9 +16,9 @@ from canwall.walls import (
     acting_force,
     actuation_state,
     correct,
+    note_missing_sample,
     predict,
     predict_open_loop,
-    restart_estimate,
     set_applied_force,
     wall_force,
 )
@@ -28,9 +28,6 @@ _MISSED = int(Trip.MISSED_TPDO)
 _NAN = int(Trip.NOT_A_NUMBER)
 _RENDERING = int(Phase.RENDERING)
 _MEASURING = int(Phase.MEASURING)
-
-#: Cycles without a sample after which the estimator starts again.
-_BLIND_CYCLES = 5
 
 
 @compiled
@@ -199,14 +196,12 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
         cycle.torque_actual = cycle.torque_per_mille
         cycle.missed_in_a_row += 1
         cycle.missed_tpdo += 1
-    came_from = cycle.oriented
     _account_contact(cycle, received)
     if received:
         compare_position(cycle, cycle.counts - before, missed)
-        if missed > _BLIND_CYCLES:
-            pause = (1 + missed) * cycle.period
-            restart_estimate(estimator, cycle.oriented, (cycle.oriented - came_from) / pause)
         correct(estimator, cycle.oriented)
+    else:
+        note_missing_sample(estimator)
     active = cycle.phase == _RENDERING or cycle.phase == _MEASURING
     due = _advance_divider(rendered, received) or (received and not active)
     _set_wall_inputs(cycle, rendered, due)
