@@ -96,6 +96,9 @@ CYCLE = np.dtype(
         ("faded", RENDERED, (1,)),
         ("fade_cycles", "i8"),
         ("fade_left", "i8"),
+        # The wall as it goes on without TPDOs, at the positions that the estimator predicts.
+        ("blind", RENDERED, (1,)),
+        ("is_blind", "?"),
         ("estimator", ESTIMATOR, (1,)),
         # Requests of the loop.
         ("phase", "i8"),
@@ -224,6 +227,7 @@ def set_wall(cycle: NDArray[np.void], wall: Wall, laws: Sequence[Law]) -> None:
     options = law.option_values(wall.options)
     index = [known.name for known in laws].index(law.name)
     cycle["orientation"] = 1.0 if wall.side == "below" else -1.0
+    cycle["is_blind"] = False
     rendered = cycle["rendered"][0]
     known = rendered["wall"][0]
     rendered["position"] = wall.position_rad

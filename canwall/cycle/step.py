@@ -59,19 +59,20 @@ def read_inputs(cycles: NDArray[np.void], data: int) -> None:
 
 
 @compiled
-def _set_wall_inputs(cycle: Record, rendered: Record, due: bool) -> None:
+def _set_wall_inputs(cycle: Record, rendered: Record, sample: float, due: bool) -> None:
     """Set position, velocity and bias force relative to the wall.
 
     The estimator works on the drive's axis, oriented towards the wall, so moving the wall does not
-    disturb it. due: True if the law will be evaluated on a new sample.
+    disturb it. sample: position on that axis [rad]. due: True if the law will be evaluated on a new
+    sample.
     """
     wall, estimator = rendered.wall[0], cycle.estimator[0]
     origin = cycle.orientation * rendered.position
-    wall.y_sample = cycle.oriented - origin
+    wall.y_sample = sample - origin
     rendered.elapsed += cycle.period
     if due:
-        wall.v_sample = (cycle.oriented - rendered.y_before) / rendered.elapsed
-        rendered.y_before = cycle.oriented
+        wall.v_sample = (sample - rendered.y_before) / rendered.elapsed
+        rendered.y_before = sample
         rendered.elapsed = 0.0
     if rendered.estimated_velocity:
         wall.v_sample = estimator.v
@@ -101,11 +102,11 @@ def _force_of(cycle: Record, rendered: Record, due: bool) -> float:
 
 
 @compiled
-def _faded_force(cycle: Record, force: float, received: bool) -> float:
+def _faded_force(cycle: Record, force: float) -> float:
     """Blend the force of the previous wall into that of the present one."""
     faded = cycle.faded[0]
-    due = _advance_divider(faded, received)
-    _set_wall_inputs(cycle, faded, due)
+    due = _advance_divider(faded, True)
+    _set_wall_inputs(cycle, faded, cycle.oriented, due)
     before = _force_of(cycle, faded, due)
     share = cycle.fade_left / (cycle.fade_cycles + 1.0)
     cycle.fade_left -= 1
@@ -115,35 +116,70 @@ def _faded_force(cycle: Record, force: float, received: bool) -> float:
 
 
 @compiled
-def _held_force(cycle: Record) -> float:
-    """Return the force without a TPDO, which is held, then ramped to zero, then ends in a trip."""
-    held = cycle.orientation * cycle.torque_per_mille * cycle.nm_per_mille
-    overdue = cycle.missed_in_a_row - cycle.hold_cycles
-    if overdue <= 0:
+def _blind_force(cycle: Record, held: float) -> float:
+    """Return the force of the law at the position that the estimator predicts.
+
+    To hold the force of a handle that is on its way out would put energy into it, and so would a
+    force that begins only after the handle has gone in.
+    """
+    if cycle.phase != _RENDERING or cycle.fade_left > 0:
         return held
-    if overdue >= cycle.ramp_cycles:
-        cycle.trip = _MISSED
-        return 0.0
-    return held * (cycle.ramp_cycles - overdue) / (cycle.ramp_cycles - overdue + 1.0)
+    if not cycle.is_blind:
+        cycle.blind[0] = cycle.rendered[0]
+        cycle.is_blind = True
+    blind = cycle.blind[0]
+    due = _advance_divider(blind, True)
+    _set_wall_inputs(cycle, blind, cycle.estimator[0].y, due)
+    force = _force_of(cycle, blind, due)
+    if due:
+        set_applied_force(blind.wall[0], force)
+    return force if math.isfinite(force) else held
 
 
 @compiled
-def _wanted_force(cycle: Record, received: bool, due: bool) -> float:
-    """Return the force out of the wall from the instant of actuation on; set a trip if any."""
-    if received:
-        check_limits(cycle)
-    elif not cycle.trip:
-        return _held_force(cycle)
+def _force_without_tpdo(cycle: Record) -> float:
+    """Return the force of the blind law, which after hold_cycles only falls, and ends in a trip."""
+    held = cycle.orientation * cycle.torque_per_mille * cycle.nm_per_mille
+    overdue = cycle.missed_in_a_row - cycle.hold_cycles
+    if overdue >= cycle.ramp_cycles:
+        cycle.trip = _MISSED
+        return 0.0
+    force = _blind_force(cycle, held)
+    if overdue <= 0:
+        return force
+    ramped = held * (cycle.ramp_cycles - overdue) / (cycle.ramp_cycles - overdue + 1.0)
+    return min(max(force, min(ramped, 0.0)), max(ramped, 0.0))
+
+
+@compiled
+def _force_with_tpdo(cycle: Record, due: bool) -> float:
+    """Return the force of the law on a new sample, or of the test; set a trip if any."""
+    check_limits(cycle)
     if cycle.trip:
         return 0.0
     if cycle.phase == _MEASURING:
         return cycle.orientation * cycle.test_per_mille * cycle.nm_per_mille
     force = _force_of(cycle, cycle.rendered[0], due)
     if cycle.fade_left > 0:
-        force = _faded_force(cycle, force, received)
+        force = _faded_force(cycle, force)
     if not math.isfinite(force):
         cycle.trip = _NAN
         return 0.0
+    return force
+
+
+@compiled
+def _wanted_force(cycle: Record, received: bool, due: bool) -> float:
+    """Return the force out of the wall from the instant of actuation on; set a trip if any."""
+    if received:
+        force = _force_with_tpdo(cycle, due)
+    elif not cycle.trip:
+        force = _force_without_tpdo(cycle)
+    else:
+        force = 0.0
+    ramping = cycle.missed_in_a_row > cycle.hold_cycles
+    if cycle.trip or ramping or cycle.phase == _MEASURING:
+        return force
     # The torque rate is limited in both directions.
     before = cycle.orientation * cycle.torque_per_mille * cycle.nm_per_mille
     most = cycle.torque_rate * cycle.period
@@ -192,6 +228,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
         read_inputs(cycles, data)
         compare_torque(cycle)
         cycle.missed_in_a_row = 0
+        cycle.is_blind = False
     else:
         cycle.torque_actual = cycle.torque_per_mille
         cycle.missed_in_a_row += 1
@@ -204,7 +241,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
         note_missing_sample(estimator)
     active = cycle.phase == _RENDERING or cycle.phase == _MEASURING
     due = _advance_divider(rendered, received) or (received and not active)
-    _set_wall_inputs(cycle, rendered, due)
+    _set_wall_inputs(cycle, rendered, cycle.oriented, due)
 
     force = 0.0
     if active:
