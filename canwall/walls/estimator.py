@@ -26,6 +26,9 @@ _SETTLED = 1e-6
 #: Variance of a quantised position [count²].
 _QUANTISATION = 1.0 / 12.0
 
+#: Square of the normalised innovation from which on a sample is as unlikely as any other.
+_IMPOSSIBLE = 25.0
+
 _HOLD = [("duration", "f8"), ("phi", "f8", (2, 2)), ("gamma", "f8", (2,))]
 
 #: Filter and model of one wall. An actuation at δ·T after the sample, δ the fraction of D, cuts a
@@ -270,9 +273,74 @@ def predict(estimator: Record, force: float) -> None:
     if not estimator.settled and estimator.gap < _LONGEST_GAP:
         _predict_covariance(estimator)
     estimator.y, estimator.v = _over_period(estimator, estimator.y, estimator.v, estimator.d, force)
+    _put_in_flight(estimator, force)
+
+
+@compiled
+def _put_in_flight(estimator: Record, force: float) -> None:
     for age in range(MAX_DELAY, 0, -1):
         estimator.in_flight[age] = estimator.in_flight[age - 1]
     estimator.in_flight[0] = force
+
+
+@compiled
+def stand_still(estimator: Record, periods: int) -> None:
+    """Advance the state over periods without SYNC, in which the drive goes on as it did.
+
+    A torque that waits for a SYNC waits on; one that has taken effect stays.
+    """
+    force = estimator.in_flight[estimator.delay_periods]
+    for _ in range(min(periods, _LONGEST_GAP + 1)):
+        note_missing_sample(estimator)
+        if estimator.gap < _LONGEST_GAP:
+            _predict_covariance(estimator)
+        estimator.y, estimator.v = _hold(
+            estimator, estimator.full[0], estimator.y, estimator.v, force + estimator.d
+        )
+    estimator.gap += max(0, periods - _LONGEST_GAP - 1)
+
+
+@compiled
+def may_lag(estimator: Record) -> bool:
+    """Return True if the forces in flight suffice for samples that are a period older."""
+    whole = estimator.delay_periods + 1
+    return whole < MAX_DELAY or (whole == MAX_DELAY and estimator.before[0].duration == 0.0)
+
+
+@compiled
+def start_lagging(lagging: Record, force: float) -> None:
+    """Turn a copy of the estimator from before a sample that is missing into one that lags.
+
+    It takes the sample that was missing for the next one, and all later samples likewise: D is a
+    period longer. force: as in `predict`, from the period without a sample.
+    """
+    lagging.delay_periods += 1
+    _put_in_flight(lagging, force)
+
+
+@compiled
+def end_lag(estimator: Record) -> None:
+    """Advance an estimator whose samples lag by a period, as the next one does no longer."""
+    estimator.delay_periods -= 1
+    note_missing_sample(estimator)
+    if estimator.gap < _LONGEST_GAP:
+        _predict_covariance(estimator)
+    n = estimator.delay_periods
+    y, v, d = estimator.y, estimator.v, estimator.d
+    before = estimator.in_flight[n + 1] if n < MAX_DELAY else 0.0
+    y, v = _hold(estimator, estimator.before[0], y, v, before + d)
+    estimator.y, estimator.v = _hold(
+        estimator, estimator.after[0], y, v, estimator.in_flight[n] + d
+    )
+
+
+@compiled
+def surprise(estimator: Record, y_sample: float) -> float:
+    """Return the negative logarithm of a sample's likelihood, bounded; call before `correct`."""
+    p = estimator.steady_covariance if estimator.settled else estimator.covariance
+    variance = p[0, 0] + _QUANTISATION
+    innovation = (y_sample - estimator.y) / estimator.scale[0]
+    return 0.5 * (min(innovation * innovation / variance, _IMPOSSIBLE) + math.log(variance))
 
 
 @compiled
