@@ -110,6 +110,9 @@ DRIVE_FRAMES = np.dtype(
         ("late_in_a_row", "i8"),
         ("late_limit", "i8"),
         ("wrong_length", "i8"),  # of the last TPDO that was too short, -1 if there was none
+        ("received", "?"),  # True if the TPDO of this cycle has come
+        ("late_tpdo", "i8"),
+        ("late_tpdo_ns", "i8"),  # from its SYNC to the last TPDO that came after it was awaited
     ],
     align=True,
 )
@@ -137,6 +140,7 @@ CORE = np.dtype(
         ("period_ns", "i8"),
         ("deadline_ns", "i8"),
         ("sync_ns", "i8"),  # of the latest SYNC, 0 before the first
+        ("sync_stamp_ns", "i8"),  # the kernel's stamp of an external SYNC, 0 if there is none
         ("sync_interval_s", "f8"),
         ("sync_interval", "u8"),
         ("sync_error", "u8"),
@@ -196,7 +200,7 @@ def proceed(cores: NDArray[np.void], now_ns: int) -> int:
         return _await_tpdos(core, now_ns)
     if stage == _SYNC_SENT:
         _log(core, now_ns + core.wall_offset_ns, 0, core.out[0], core.out[1], core.out[2])
-        _begin_cycle(core, core.sending_ns)
+        _begin_cycle(core, core.sending_ns, core.sending_ns - core.sync_ns)
         return _await_tpdos(core, now_ns)
     if stage == _RPDO_SENT:
         _complete_answer(core, now_ns)
@@ -233,17 +237,36 @@ def take(
                 if not complete:
                     drive.wrong_length = length
                 received_ns = min(now_ns, wall_ns - core.wall_offset_ns)
+                drive.received = complete
                 return _answer(core, k, data if complete else 0, complete, received_ns)
     elif core.stage == _SYNC_AWAITED and can_id == core.sync_id:
         core.deadline_ns = now_ns + core.period_ns
-        _begin_cycle(core, now_ns)
+        # Of a master that stood still, the SYNCs have waited; only the kernel knows how long.
+        since_ns = stamp_ns - core.sync_stamp_ns if stamp_ns and core.sync_stamp_ns else 0
+        core.sync_stamp_ns = stamp_ns
+        _begin_cycle(core, now_ns, since_ns)
         return _await_tpdos(core, now_ns)
     # Before a SYNC this may be a late or duplicate TPDO. Mistaken for the next one, it would delay
     # all following positions by a cycle.
+    _note_late_tpdo(core, can_id, min(now_ns, wall_ns - core.wall_offset_ns))
     _hand_over(core, wall_ns, can_id, length, data)
     if core.stage == _DRAINING:
         return _DRAIN
     return _urgent(core) or _FRAME
+
+
+@compiled
+def _note_late_tpdo(core: Record, can_id: int, received_ns: int) -> None:
+    """Note a TPDO that comes too late for its SYNC, or besides another one."""
+    drives = elements(core.drives, core.drives_length, DRIVE_FRAMES)
+    for k in range(len(drives)):
+        drive: Record = drives[k]
+        if can_id == drive.tpdo_id and core.sync_ns and not drive.awaited:
+            if not drive.received:
+                drive.late_tpdo += 1
+                drive.late_tpdo_ns = received_ns - core.sync_ns
+            else:
+                elements(drive.cycle, 1, CYCLE)[0].overtaken = True
 
 
 @compiled
@@ -276,6 +299,11 @@ def _send_sync(core: Record, now_ns: int) -> int:
             return _urgent(core)
         core.stage = _SYNC_DUE
     if core.real_time:
+        if now_ns - core.deadline_ns > core.period_ns // 2:
+            # The master stood still: the SYNCs keep to their grid, on which the drive may insist.
+            core.deadline_ns = next_deadline(core.deadline_ns, now_ns, core.period_ns)
+            core.stage = _BEFORE
+            return _start(core, now_ns)
         if now_ns < core.deadline_ns:
             return _SPIN
         core.deadline_ns = next_deadline(core.deadline_ns, now_ns, core.period_ns)
@@ -296,19 +324,28 @@ def next_deadline(deadline_ns: int, now_ns: int, period_ns: int) -> int:
 
 
 @compiled
-def _begin_cycle(core: Record, sync_ns: int) -> None:
-    """Begin to wait for the TPDOs of a SYNC."""
+def _begin_cycle(core: Record, sync_ns: int, since_ns: int) -> None:
+    """Begin to wait for the TPDOs of a SYNC.
+
+    since_ns: time since the SYNC before on the bus, if it is known, for the SYNCs skipped between.
+    """
     interval = sync_ns - core.sync_ns if core.sync_ns else 0
     if interval:
         observe_ns(elements(core.sync_interval, 1, HISTOGRAM), interval)
         observe_ns(elements(core.sync_error, 1, HISTOGRAM), abs(interval - core.period_ns))
+    skipped = 0
+    if core.real_time and core.sync_ns:  # simulated time stands still with the master
+        skipped = max(0, (since_ns + core.period_ns // 2) // core.period_ns - 1)
     core.sync_ns = sync_ns
     core.sync_interval_s = interval * 1e-9
     timeout = core.timeout_ns
     drives = elements(core.drives, core.drives_length, DRIVE_FRAMES)
     for k in range(len(drives)):
         drives[k].awaited = True
-        if elements(drives[k].cycle, 1, CYCLE)[0].missed_in_a_row:
+        drives[k].received = False
+        cycle: Record = elements(drives[k].cycle, 1, CYCLE)[0]
+        cycle.skipped = skipped
+        if cycle.missed_in_a_row:
             timeout = core.missing_timeout_ns
     core.tpdo_until_ns = sync_ns + timeout
     core.stage = _TPDO_AWAITED

@@ -29,6 +29,9 @@ from canwall.walls import (
 #: Largest number of laws in a run.
 MAX_LAWS = 16
 
+#: Cycles that count for the question if TPDOs have been missing of late.
+RECENT_CYCLES = 50
+
 #: Delay of a torque carried by a synchronous RPDO (theory, section 3).
 SYNCHRONOUS_DELAY = 1.0
 
@@ -96,11 +99,23 @@ CYCLE = np.dtype(
         ("faded", RENDERED, (1,)),
         ("fade_cycles", "i8"),
         ("fade_left", "i8"),
+        # The wall as it goes on without TPDOs, at the positions that the estimator predicts.
+        ("blind", RENDERED, (1,)),
+        ("is_blind", "?"),
         ("estimator", ESTIMATOR, (1,)),
+        # The same for TPDOs that have been a cycle late since one was missing: while it is being
+        # compared, how much likelier it has been; the number of cycles that was found.
+        ("lagging", ESTIMATOR, (1,)),
+        ("compares_lag", "?"),
+        ("lag_evidence", "f8"),
+        ("lag", "i8"),
         # Requests of the loop.
         ("phase", "i8"),
         ("controlword", "i8"),
         ("test_per_mille", "i8"),
+        # Reports of the transport: SYNCs skipped before this one; a second TPDO since the last one.
+        ("skipped", "i8"),
+        ("overtaken", "?"),
         # DriveState.
         ("j", "i8"),
         ("counts", "i8"),
@@ -108,6 +123,7 @@ CYCLE = np.dtype(
         ("torque_actual", "i8"),
         ("torque_per_mille", "i8"),
         ("missed_in_a_row", "i8"),
+        ("missed_recently", "i8"),  # a bit for each of the last RECENT_CYCLES, 1 if missing
         # True once the estimator has a position; its last prediction error.
         ("started", "?"),
         ("innovation", "f8"),
@@ -131,6 +147,7 @@ CYCLE = np.dtype(
         # Results.
         ("trip", "i8"),
         ("missed_tpdo", "i8"),
+        ("skipped_sync", "i8"),
         ("strikes", "i8"),
     ],
     align=True,
@@ -186,7 +203,14 @@ def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None
         force_walk=settings.estimator.force_walk_nm_per_sqrt_s,
         delay=delay,
     )
-    reset_estimator(cycle["estimator"][0], float(cycle["oriented"][0]))
+    _reset(cycle, float(cycle["oriented"][0]))
+
+
+def _reset(cycle: NDArray[np.void], oriented: float) -> None:
+    """Reset the estimator at a position [rad]; TPDOs are what its delay takes them for."""
+    reset_estimator(cycle["estimator"][0], oriented)
+    cycle["compares_lag"] = False
+    cycle["lag"] = 0
 
 
 def _set_field(cycle: NDArray[np.void], name: str, layout: PdoLayout, index: int) -> None:
@@ -224,6 +248,7 @@ def set_wall(cycle: NDArray[np.void], wall: Wall, laws: Sequence[Law]) -> None:
     options = law.option_values(wall.options)
     index = [known.name for known in laws].index(law.name)
     cycle["orientation"] = 1.0 if wall.side == "below" else -1.0
+    cycle["is_blind"] = False
     rendered = cycle["rendered"][0]
     known = rendered["wall"][0]
     rendered["position"] = wall.position_rad
@@ -259,6 +284,6 @@ def fade_in(cycle: NDArray[np.void], cycles: int) -> None:
 def start_at(cycle: NDArray[np.void], counts: int) -> None:
     """Begin at rest at a position, the first that the drive reports."""
     oriented = cycle["orientation"][0] * counts * cycle["rad_per_count"][0]
-    reset_estimator(cycle["estimator"][0], oriented)
+    _reset(cycle, oriented)
     cycle["oriented"] = cycle["rendered"]["y_before"] = oriented
     cycle["started"] = True

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
+from canwall.cycle.state import RECENT_CYCLES
 from canwall.cycle.trips import Trip, check_limits, compare_position, compare_torque
 from canwall.record import Phase
 from canwall.units import to_per_mille
@@ -16,10 +17,15 @@ from canwall.walls import (
     acting_force,
     actuation_state,
     correct,
+    end_lag,
+    may_lag,
+    note_missing_sample,
     predict,
     predict_open_loop,
-    restart_estimate,
     set_applied_force,
+    stand_still,
+    start_lagging,
+    surprise,
     wall_force,
 )
 
@@ -28,9 +34,11 @@ _MISSED = int(Trip.MISSED_TPDO)
 _NAN = int(Trip.NOT_A_NUMBER)
 _RENDERING = int(Phase.RENDERING)
 _MEASURING = int(Phase.MEASURING)
-
-#: Cycles without a sample after which the estimator starts again.
-_BLIND_CYCLES = 5
+#: A bit for each of the cycles that count as recent.
+_RECENT = (1 << RECENT_CYCLES) - 1
+#: Logarithm of the likelihood ratio at which it is decided if TPDOs have begun to be a cycle late:
+#: at least three samples.
+_LAG_EVIDENCE = 30.0
 
 
 @compiled
@@ -50,10 +58,24 @@ def _placed(value: int, field: Record) -> int:
 
 
 @compiled
+def _unwrapped(value: int, before: int, bits: int) -> int:
+    """Return the value that is nearest to the one before, of all that have the same bits."""
+    half = 1 << (bits - 1)
+    return before + ((value - before + half) & ((1 << bits) - 1)) - half
+
+
+@compiled
 def read_inputs(cycles: NDArray[np.void], data: int) -> None:
-    """Read position, statusword and torque from a TPDO's data (little-endian number)."""
+    """Read position, statusword and torque from a TPDO's data (little-endian number).
+
+    A position that overflows goes on: a motor that always turns one way reaches the end of
+    0x6064's 32 bits.
+    """
     cycle: Record = cycles[0]
-    cycle.counts = _signed(data, cycle.in_position[0])
+    counts = _signed(data, cycle.in_position[0])
+    if cycle.started:
+        counts = _unwrapped(counts, cycle.counts, cycle.in_position[0].bits)
+    cycle.counts = counts
     cycle.statusword = _unsigned(data, cycle.in_statusword[0])
     if cycle.in_torque[0].bits:
         cycle.torque_actual = _signed(data, cycle.in_torque[0])
@@ -62,19 +84,20 @@ def read_inputs(cycles: NDArray[np.void], data: int) -> None:
 
 
 @compiled
-def _set_wall_inputs(cycle: Record, rendered: Record, due: bool) -> None:
+def _set_wall_inputs(cycle: Record, rendered: Record, sample: float, due: bool) -> None:
     """Set position, velocity and bias force relative to the wall.
 
     The estimator works on the drive's axis, oriented towards the wall, so moving the wall does not
-    disturb it. due: True if the law will be evaluated on a new sample.
+    disturb it. sample: position on that axis [rad]. due: True if the law will be evaluated on a new
+    sample.
     """
     wall, estimator = rendered.wall[0], cycle.estimator[0]
     origin = cycle.orientation * rendered.position
-    wall.y_sample = cycle.oriented - origin
+    wall.y_sample = sample - origin
     rendered.elapsed += cycle.period
     if due:
-        wall.v_sample = (cycle.oriented - rendered.y_before) / rendered.elapsed
-        rendered.y_before = cycle.oriented
+        wall.v_sample = (sample - rendered.y_before) / rendered.elapsed
+        rendered.y_before = sample
         rendered.elapsed = 0.0
     if rendered.estimated_velocity:
         wall.v_sample = estimator.v
@@ -104,11 +127,11 @@ def _force_of(cycle: Record, rendered: Record, due: bool) -> float:
 
 
 @compiled
-def _faded_force(cycle: Record, force: float, received: bool) -> float:
+def _faded_force(cycle: Record, force: float) -> float:
     """Blend the force of the previous wall into that of the present one."""
     faded = cycle.faded[0]
-    due = _advance_divider(faded, received)
-    _set_wall_inputs(cycle, faded, due)
+    due = _advance_divider(faded, True)
+    _set_wall_inputs(cycle, faded, cycle.oriented, due)
     before = _force_of(cycle, faded, due)
     share = cycle.fade_left / (cycle.fade_cycles + 1.0)
     cycle.fade_left -= 1
@@ -118,35 +141,70 @@ def _faded_force(cycle: Record, force: float, received: bool) -> float:
 
 
 @compiled
-def _held_force(cycle: Record) -> float:
-    """Return the force without a TPDO, which is held, then ramped to zero, then ends in a trip."""
-    held = cycle.orientation * cycle.torque_per_mille * cycle.nm_per_mille
-    overdue = cycle.missed_in_a_row - cycle.hold_cycles
-    if overdue <= 0:
+def _blind_force(cycle: Record, held: float) -> float:
+    """Return the force of the law at the position that the estimator predicts.
+
+    To hold the force of a handle that is on its way out would put energy into it, and so would a
+    force that begins only after the handle has gone in.
+    """
+    if cycle.phase != _RENDERING or cycle.fade_left > 0:
         return held
-    if overdue >= cycle.ramp_cycles:
-        cycle.trip = _MISSED
-        return 0.0
-    return held * (cycle.ramp_cycles - overdue) / (cycle.ramp_cycles - overdue + 1.0)
+    if not cycle.is_blind:
+        cycle.blind[0] = cycle.rendered[0]
+        cycle.is_blind = True
+    blind = cycle.blind[0]
+    due = _advance_divider(blind, True)
+    _set_wall_inputs(cycle, blind, cycle.estimator[0].y, due)
+    force = _force_of(cycle, blind, due)
+    if due:
+        set_applied_force(blind.wall[0], force)
+    return force if math.isfinite(force) else held
 
 
 @compiled
-def _wanted_force(cycle: Record, received: bool, due: bool) -> float:
-    """Return the force out of the wall from the instant of actuation on; set a trip if any."""
-    if received:
-        check_limits(cycle)
-    elif not cycle.trip:
-        return _held_force(cycle)
+def _force_without_tpdo(cycle: Record) -> float:
+    """Return the force of the blind law, which after hold_cycles only falls, and ends in a trip."""
+    held = cycle.orientation * cycle.torque_per_mille * cycle.nm_per_mille
+    overdue = cycle.missed_in_a_row - cycle.hold_cycles
+    if overdue >= cycle.ramp_cycles:
+        cycle.trip = _MISSED
+        return 0.0
+    force = _blind_force(cycle, held)
+    if overdue <= 0:
+        return force
+    ramped = held * (cycle.ramp_cycles - overdue) / (cycle.ramp_cycles - overdue + 1.0)
+    return min(max(force, min(ramped, 0.0)), max(ramped, 0.0))
+
+
+@compiled
+def _force_with_tpdo(cycle: Record, due: bool) -> float:
+    """Return the force of the law on a new sample, or of the test; set a trip if any."""
+    check_limits(cycle)
     if cycle.trip:
         return 0.0
     if cycle.phase == _MEASURING:
         return cycle.orientation * cycle.test_per_mille * cycle.nm_per_mille
     force = _force_of(cycle, cycle.rendered[0], due)
     if cycle.fade_left > 0:
-        force = _faded_force(cycle, force, received)
+        force = _faded_force(cycle, force)
     if not math.isfinite(force):
         cycle.trip = _NAN
         return 0.0
+    return force
+
+
+@compiled
+def _wanted_force(cycle: Record, received: bool, due: bool) -> float:
+    """Return the force out of the wall from the instant of actuation on; set a trip if any."""
+    if received:
+        force = _force_with_tpdo(cycle, due)
+    elif not cycle.trip:
+        force = _force_without_tpdo(cycle)
+    else:
+        force = 0.0
+    ramping = cycle.missed_in_a_row > cycle.hold_cycles
+    if cycle.trip or ramping or cycle.phase == _MEASURING:
+        return force
     # The torque rate is limited in both directions.
     before = cycle.orientation * cycle.torque_per_mille * cycle.nm_per_mille
     most = cycle.torque_rate * cycle.period
@@ -179,6 +237,70 @@ def _account_contact(cycle: Record, received: bool) -> None:
 
 
 @compiled
+def _stand_still(cycle: Record) -> int:
+    """Let the handle go on through SYNCs that were skipped; return their number."""
+    skipped = cycle.skipped
+    if skipped:
+        cycle.skipped = 0
+        cycle.skipped_sync += skipped
+        cycle.rendered[0].elapsed += skipped * cycle.period
+        cycle.faded[0].elapsed += skipped * cycle.period
+        cycle.blind[0].elapsed += skipped * cycle.period
+        stand_still(cycle.estimator[0], skipped)
+        # A TPDO that is a cycle late has come meanwhile.
+        cycle.compares_lag = False
+    return skipped
+
+
+@compiled
+def _may_begin_to_lag(cycle: Record) -> bool:
+    """Keep the estimator as it would be if the TPDO that is missing comes with the next SYNC.
+
+    If all later ones are as late, only the motion shows it: there is one TPDO for each SYNC again.
+    """
+    estimator = cycle.estimator[0]
+    known = cycle.compares_lag and cycle.lag_evidence > 0.0
+    if known:
+        note_missing_sample(cycle.lagging[0])
+    if known or not cycle.started or not may_lag(estimator):
+        return False
+    cycle.lagging[0] = estimator
+    cycle.compares_lag = True
+    cycle.lag_evidence = 0.0
+    return True
+
+
+@compiled
+def _compare_lag(cycle: Record) -> None:
+    """Compare the sample with both predictions, and go on with the likelier one in the end."""
+    estimator, lagging = cycle.estimator[0], cycle.lagging[0]
+    cycle.lag_evidence += surprise(estimator, cycle.oriented) - surprise(lagging, cycle.oriented)
+    if cycle.lag_evidence > _LAG_EVIDENCE:
+        cycle.estimator[0] = lagging
+        cycle.lag += 1
+    if abs(cycle.lag_evidence) > _LAG_EVIDENCE:
+        cycle.compares_lag = False
+    else:
+        correct(lagging, cycle.oriented)
+
+
+@compiled
+def _end_lag(cycle: Record) -> None:
+    """Let the lag end with a second TPDO in a cycle: the first was one of the SYNC before."""
+    if not cycle.overtaken:
+        return
+    cycle.overtaken = False
+    if cycle.compares_lag:
+        cycle.compares_lag = False
+        if cycle.lag_evidence > 0.0:
+            cycle.estimator[0] = cycle.lagging[0]
+            end_lag(cycle.estimator[0])
+    elif cycle.lag:
+        end_lag(cycle.estimator[0])
+        cycle.lag -= 1
+
+
+@compiled
 def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: bool) -> int:
     """Return RPDO data for TPDO data (little-endian numbers), and fill the row of this cycle.
 
@@ -190,26 +312,33 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     rendered = cycle.rendered[0]
     wall = rendered.wall[0]
     estimator = cycle.estimator[0]
-    before, missed = cycle.counts, cycle.missed_in_a_row
+    skipped = _stand_still(cycle)
+    _end_lag(cycle)
+    before, missed = cycle.counts, cycle.missed_in_a_row + skipped
+    cycle.missed_recently = (cycle.missed_recently << 1) & _RECENT
     if received:
         read_inputs(cycles, data)
         compare_torque(cycle)
         cycle.missed_in_a_row = 0
+        cycle.is_blind = False
     else:
         cycle.torque_actual = cycle.torque_per_mille
         cycle.missed_in_a_row += 1
         cycle.missed_tpdo += 1
-    came_from = cycle.oriented
+        cycle.missed_recently |= 1
     _account_contact(cycle, received)
+    begins_lag = False
     if received:
         compare_position(cycle, cycle.counts - before, missed)
-        if missed > _BLIND_CYCLES:
-            pause = (1 + missed) * cycle.period
-            restart_estimate(estimator, cycle.oriented, (cycle.oriented - came_from) / pause)
+        if cycle.compares_lag:
+            _compare_lag(cycle)
         correct(estimator, cycle.oriented)
+    else:
+        begins_lag = _may_begin_to_lag(cycle)
+        note_missing_sample(estimator)
     active = cycle.phase == _RENDERING or cycle.phase == _MEASURING
     due = _advance_divider(rendered, received) or (received and not active)
-    _set_wall_inputs(cycle, rendered, due)
+    _set_wall_inputs(cycle, rendered, cycle.oriented, due)
 
     force = 0.0
     if active:
@@ -220,6 +349,10 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     if cycle.frozen and cycle.frozen < cycle.stuck_cycles:
         predict_open_loop(estimator, sent)
     predict(estimator, sent)
+    if begins_lag:
+        start_lagging(cycle.lagging[0], sent)
+    elif cycle.compares_lag:
+        predict(cycle.lagging[0], sent)
     cycle.force_applied = acting_force(estimator)
     if due:
         set_applied_force(wall, sent)

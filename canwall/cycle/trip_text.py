@@ -2,8 +2,12 @@
 
 from canwall.cycle.axis import WallAxis
 from canwall.cycle.exchange import Exchange
+from canwall.cycle.state import RECENT_CYCLES
 from canwall.cycle.trips import Trip
 from canwall.drive import status_text
+
+#: Trips to which wrong or missing positions lead.
+_FROM_POSITIONS = (Trip.SPEED, Trip.POSITION, Trip.JUMP, Trip.STUCK, Trip.TORQUE, Trip.ENERGY)
 
 
 def shown_state(axis: WallAxis) -> str:
@@ -33,8 +37,10 @@ def trip_text(axis: WallAxis, exchange: Exchange) -> str:
         case Trip.JUMP:
             what = (
                 f"the position jumped by {abs(float(cycle['innovation'])):.3g} rad, more than "
-                f"{_jump_key(axis)} allows: look to the encoder and its cable"
+                f"{_jump_key(axis)} allows"
             )
+            if not _missing_recently(axis):
+                what += ": look to the encoder and its cable"
         case Trip.STUCK:
             what = (
                 f"the position has not changed for {int(cycle['frozen'])} cycles, in which the "
@@ -51,13 +57,16 @@ def trip_text(axis: WallAxis, exchange: Exchange) -> str:
             energy = float(cycle["energy_out"])
             what = f"the wall has put out {energy:.3g} J in this contact, beyond limits.energy_j"
         case Trip.MISSED_TPDO:
-            what = f"no TPDO for {int(cycle['missed_in_a_row'])} cycles{_too_short(axis)}"
+            what = f"no TPDO for {int(cycle['missed_in_a_row'])} cycles"
+            what += _too_short(axis) + _too_late(axis)
         case Trip.NOT_ENABLED:
             what = f"the drive left OPERATION ENABLED: {shown_state(axis)}{latest_emergency(axis)}"
         case Trip.REPORTED:
             what = axis.reported
         case _:
             what = _failed_law(axis)
+    if trip in _FROM_POSITIONS:
+        what += _missing_recently(axis)
     if trip in (Trip.NOT_ENABLED, Trip.REPORTED):
         what += _pause(axis, exchange)
     return f"cycle {j} ({j * float(cycle['period']):.3f} s): {what}"
@@ -72,6 +81,17 @@ def _failed_law(axis: WallAxis) -> str:
     return f"law {axis.laws[present].name} gave a force that is not a number"
 
 
+def _missing_recently(axis: WallAxis) -> str:
+    """Name missing TPDOs as the likely reason of a trip; empty if there were none."""
+    missing = int(axis.cycle["missed_recently"][0]).bit_count()
+    if not missing:
+        return ""
+    return (
+        f"; {missing} of the last {RECENT_CYCLES} TPDOs were missing: look to the bus, its load "
+        f"and its termination, first"
+    )
+
+
 def _jump_key(axis: WallAxis) -> str:
     return "limits.jump_rad" if axis.limits.jump_rad else "limits.speed_rad_s"
 
@@ -83,6 +103,16 @@ def _too_short(axis: WallAxis) -> str:
     return (
         f" (0x{tpdo.cob_id:03X} came with {axis.wrong_length} bytes, {tpdo.length} carry what is "
         f"mapped)"
+    )
+
+
+def _too_late(axis: WallAxis) -> str:
+    late, after_ns = (int(axis.frames[name][0]) for name in ("late_tpdo", "late_tpdo_ns"))
+    if not late or not axis.settings.real_time:
+        return ""
+    return (
+        f"; {late} came too late, the last one {after_ns * 1e-6:.3g} ms after its SYNC: "
+        f"bus.cycle_s is too short for the drive or the bus"
     )
 
 

@@ -94,7 +94,8 @@ def compare_position(cycle: Record, change: int, missed: int) -> None:
     """Compare the position with the one predicted; a jump trips before the estimator uses it.
 
     The prediction follows the torques in flight and the estimated force, also through `missed`
-    cycles without a sample. change: change of the position since the last sample [counts].
+    cycles without a sample. Thereafter it is uncertain, and a position counts as possible if the
+    last one is near enough. change: change of the position since the last sample [counts].
     """
     cycle.innovation = cycle.oriented - cycle.estimator[0].y
     if missed or not cycle.started:
@@ -115,7 +116,10 @@ def compare_position(cycle: Record, change: int, missed: int) -> None:
             if cycle.orientation * cycle.rad_per_count * cycle.change < 0.0:
                 ahead = -ahead
             cycle.motion_missed = max(cycle.motion_missed, ahead)
-    jumped = not abs(cycle.innovation) <= cycle.jump_limit * (1 + missed)
+    limit = cycle.jump_limit * (1 + missed)
+    jumped = not abs(cycle.innovation) <= limit
+    if not cycle.estimator[0].settled:
+        jumped = jumped and not abs(change * cycle.rad_per_count) <= limit
     if jumped and cycle.started and cycle.phase != _LEAVING and cycle.trip == 0:
         position = cycle.counts * cycle.rad_per_count
         inside = cycle.position_low <= position <= cycle.position_high

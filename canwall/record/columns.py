@@ -55,7 +55,7 @@ COLUMNS = (
     Column("t_s", "f8", "s", "nominal time of the SYNC: j times the cycle"),
     Column("phase", "u1", "", f"what the cycle was for: {_PHASES}"),
     Column("received", "?", "", "whether the TPDO of this SYNC came in time"),
-    Column("counts", "i4", "count", "position actual value, 0x6064"),
+    Column("counts", "i8", "count", "position actual value, 0x6064, continued beyond 32 bits"),
     Column("statusword", "u2", "", "statusword, 0x6041"),
     Column("controlword", "u2", "", "controlword as sent, 0x6040"),
     Column("position_rad", "f8", "rad", "position of the drive's axis"),

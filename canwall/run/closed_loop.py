@@ -54,11 +54,37 @@ ENABLING_CYCLES = 7
 
 @dataclass(frozen=True)
 class SimulatedRun:
-    """Result of a closed loop: a row (dtype ROW) per cycle up to the trip, if there is one."""
+    """Result of a closed loop: a row (dtype ROW) per cycle up to the trip, if there is one.
+
+    `positions` are those at the SYNCs relative to the wall [rad], also of TPDOs that are lost.
+    `lag` is the number of cycles by which the TPDOs were found to be late in the end.
+    """
 
     rows: NDArray[np.void]
     units: DriveUnits
     trip: Trip
+    positions: Array
+    lag: int
+
+
+@dataclass(frozen=True)
+class Disturbances:
+    """What bus and master do to TPDOs and SYNCs; each of shape (cycles,).
+
+    Attributes:
+        lost: True for each SYNC whose TPDO is lost.
+        late: True for each SYNC that gets the TPDO of the one before.
+        skipped: SYNCs that the master skips after each one.
+    """
+
+    lost: NDArray[np.bool_]
+    late: NDArray[np.bool_]
+    skipped: NDArray[np.int64]
+
+    @classmethod
+    def none(cls, cycles: int) -> "Disturbances":
+        """Return those of a bus and a master without faults, to be changed in place."""
+        return cls(np.zeros(cycles, bool), np.zeros(cycles, bool), np.zeros(cycles, np.int64))
 
 
 class LoopRecords(NamedTuple):
@@ -77,6 +103,9 @@ class LoopRecords(NamedTuple):
         whole: Whole periods of the delay D.
         share: Rest of the delay D [periods].
         enabling: Cycles before the wall is rendered.
+        lost: See `Disturbances`, as the following.
+        late: TPDOs of the SYNC before.
+        skipped: SYNCs skipped.
     """
 
     cycle: NDArray[np.void]
@@ -91,9 +120,17 @@ class LoopRecords(NamedTuple):
     whole: int
     share: float
     enabling: int
+    lost: NDArray[np.bool_]
+    late: NDArray[np.bool_]
+    skipped: NDArray[np.int64]
 
 
-def simulate(settings: Settings, cycles: int, enabling: int = ENABLING_CYCLES) -> SimulatedRun:
+def simulate(
+    settings: Settings,
+    cycles: int,
+    enabling: int = ENABLING_CYCLES,
+    disturbances: Disturbances | None = None,
+) -> SimulatedRun:
     """Render the wall of a configuration in memory.
 
     The delay of the loop is one period for a synchronous RPDO, none for one that acts on reception,
@@ -103,20 +140,29 @@ def simulate(settings: Settings, cycles: int, enabling: int = ENABLING_CYCLES) -
         settings: Configuration with `[simulation]`, without changes of the wall.
         cycles: Number of SYNCs.
         enabling: Number of SYNCs without torque at the start.
+        disturbances: What bus and master do. Default: nothing.
 
     Raises:
         ConfigError: If only a run can render the configuration.
     """
-    loop = ClosedLoop(settings, cycles, enabling)
-    records, rows = loop.records(), np.zeros(cycles, ROW)
-    done = simulate_loop(records, rows, np.empty((3, cycles)))
-    return SimulatedRun(rows[:done], loop.units, Trip(int(records.cycle["trip"][0])))
+    loop = ClosedLoop(settings, cycles, enabling, disturbances)
+    records, rows, signals = loop.records(), np.zeros(cycles, ROW), np.empty((3, cycles))
+    done = simulate_loop(records, rows, signals)
+    trip = Trip(int(records.cycle["trip"][0]))
+    lag = int(records.cycle["lag"][0])
+    return SimulatedRun(rows[:done], loop.units, trip, signals[0, :done], lag)
 
 
 class ClosedLoop:
     """Cycle, servo and hand of a configuration, to be simulated with one wall or several."""
 
-    def __init__(self, settings: Settings, cycles: int, enabling: int = ENABLING_CYCLES) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        cycles: int,
+        enabling: int = ENABLING_CYCLES,
+        disturbances: Disturbances | None = None,
+    ) -> None:
         """Prepare a loop; arguments and errors are those of `simulate`."""
         simulation = settings.simulation
         if simulation is None:
@@ -143,6 +189,7 @@ class ClosedLoop:
         self._whole = math.floor(delay)
         self._share = delay - self._whole
         self._enabling = enabling
+        self._disturbances = disturbances or Disturbances.none(cycles)
 
     def records(self) -> LoopRecords:
         """Return records for a thread of its own; several may simulate the loop at a time."""
@@ -160,6 +207,9 @@ class ClosedLoop:
             self._whole,
             self._share,
             self._enabling,
+            self._disturbances.lost,
+            self._disturbances.late,
+            self._disturbances.skipped,
         )
 
 
@@ -267,6 +317,8 @@ def _run_cycles(loop: LoopRecords, rows: NDArray[np.void], signals: Array) -> in
     nm_per_mille, whole, share = loop.nm_per_mille, loop.whole, loop.share
     cycle: Record = cycles[0]
     period, counts = cycle.period, encoder_counts(servos)
+    late, skipped = loop.late, loop.skipped
+    data = data_before = 0
     # Torques in per mille that are on their way: sent[k] was computed k samples ago.
     sent = np.zeros(MAX_DELAY + 2, np.int64)
     at = 0
@@ -275,19 +327,31 @@ def _run_cycles(loop: LoopRecords, rows: NDArray[np.void], signals: Array) -> in
             cycle.phase = _RENDERING
         # The drive shows the torque that acts at the SYNC, not the one that is still on its way.
         shown = sent[whole] if share > 0.0 or whole == 0 else sent[whole - 1]
+        data_before = data
         data = (counts & 0xFFFFFFFF) | (_ENABLED << 32) | ((shown & 0xFFFF) << 48)
-        step(cycles, rows[at : at + 1], data, True)
+        taken = data_before if late[j] else data
+        step(cycles, rows[at : at + 1], taken, not loop.lost[j])
+        # Two TPDOs come in the cycle in which they are late for the last time.
+        cycle.overtaken = late[j] and not (j + 1 < len(push) and late[j + 1])
         row: Record = rows[at]
-        signals[0, j], signals[1, j], signals[2, j] = row.y, row.force_applied, row.torque_cmd
+        oriented = cycle.orientation * counts * cycle.rad_per_count
+        signals[0, j] = oriented - cycle.orientation * cycle.rendered[0].position
+        signals[1, j], signals[2, j] = row.force_applied, row.torque_cmd
         at = at + 1 if at + 1 < len(rows) else 0
         for k in range(MAX_DELAY + 1, 0, -1):
             sent[k] = sent[k - 1]
         sent[0] = cycle.torque_per_mille
-        late = share * period
+        before = share * period
         if share > 0.0:
-            move_servo(servos, sent[whole + 1] * nm_per_mille, push[j], slope[j], late)
-        after = push[j] + slope[j] * late if share > 0.0 else push[j]
-        counts = move_servo(servos, sent[whole] * nm_per_mille, after, slope[j], period - late)
+            move_servo(servos, sent[whole + 1] * nm_per_mille, push[j], slope[j], before)
+        after = push[j] + slope[j] * before if share > 0.0 else push[j]
+        torque = sent[whole] * nm_per_mille
+        counts = move_servo(servos, torque, after, slope[j], period - before)
+        if skipped[j]:
+            # The hand, whose script is one of SYNCs, waits.
+            after = push[j] + slope[j] * period
+            counts = move_servo(servos, torque, after, 0.0, skipped[j] * period)
+            cycle.skipped = skipped[j]
         if cycle.trip != 0:
             return j + 1
     return len(push)

@@ -7,6 +7,7 @@ observable, so it need not be known.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,17 @@ from canwall.physics import zoh
 
 #: Largest delay, in whole periods, between a sample and the force computed from it.
 MAX_DELAY = 3
+
+#: Periods without a sample after which the prediction says nothing about a hand's motion: the
+#: estimate starts again, and its uncertainty grows no further.
+_LONGEST_GAP = 32
+#: Relative distance within which a gain has converged to the steady state.
+_SETTLED = 1e-6
+#: Variance of a quantised position [count²].
+_QUANTISATION = 1.0 / 12.0
+
+#: Square of the normalised innovation from which on a sample is as unlikely as any other.
+_IMPOSSIBLE = 25.0
 
 _HOLD = [("duration", "f8"), ("phi", "f8", (2, 2)), ("gamma", "f8", (2,))]
 
@@ -27,6 +39,17 @@ ESTIMATOR = np.dtype(
         ("v", "f8"),
         ("d", "f8"),
         ("gain", "f8", (3,)),
+        # In the steady state the gain is `steady_gain`. Otherwise it follows from the covariance
+        # of [y, ẏ, d] before the sample, which is in units of `scale`, as its model is.
+        ("settled", "?"),
+        ("gap", "i8"),  # periods without a sample since the last one, `sampled`
+        ("sampled", "f8"),
+        ("covariance", "f8", (3, 3)),
+        ("steady_gain", "f8", (3,)),
+        ("steady_covariance", "f8", (3, 3)),
+        ("transition", "f8", (3, 3)),
+        ("force_noise", "f8"),
+        ("scale", "f8", (3,)),
         ("mass", "f8"),
         ("coulomb", "f8"),
         ("delay_periods", "i8"),
@@ -44,10 +67,28 @@ ESTIMATOR = np.dtype(
 )
 
 
-def kalman_gain(
+class KalmanModel(NamedTuple):
+    """Model and steady state of the filter on [y, ẏ, d], in units of `scale`.
+
+    Attributes:
+        transition: Transition over one period, shape (3, 3).
+        force_noise: Variance that the bias force gains in one period.
+        covariance: Covariance before a sample in the steady state, shape (3, 3).
+        gain: Gain in the steady state, in SI units, shape (3,).
+        scale: The units in SI units, shape (3,).
+    """
+
+    transition: NDArray[np.float64]
+    force_noise: float
+    covariance: NDArray[np.float64]
+    gain: NDArray[np.float64]
+    scale: NDArray[np.float64]
+
+
+def kalman_model(
     mass: float, viscous: float, spring: float, period: float, count: float, force_walk: float
-) -> NDArray[np.float64]:
-    """Return the steady-state gain on [y, ẏ, d] for a quantised position; shape (3,).
+) -> KalmanModel:
+    """Return the Kalman filter on [y, ẏ, d] for a quantised position.
 
     The position is quantised in steps of `count`, so R = count²/12. The bias force is a random
     walk of `force_walk` = q [N·m/√s]. For a pure mass the continuous filter then has Butterworth
@@ -66,10 +107,11 @@ def kalman_gain(
     omega = (12.0 * force_walk**2 / (mass * mass * count * count * period)) ** (1.0 / 6.0)
     scale = np.array([count, count * omega, count * mass * omega * omega])
     a = a * scale[None, :] / scale[:, None]
-    noise = np.diag([0.0, 0.0, period * (force_walk / scale[2]) ** 2])
-    prior = solve_discrete_are(a.T, c.T, noise, np.array([[1.0 / 12.0]]))
-    gain = prior @ c.T / (c @ prior @ c.T + 1.0 / 12.0)
-    return np.asarray(gain[:, 0] * scale / count)
+    force_noise = period * (force_walk / scale[2]) ** 2
+    noise = np.diag([0.0, 0.0, force_noise])
+    prior = solve_discrete_are(a.T, c.T, noise, np.array([[_QUANTISATION]]))
+    gain = prior @ c.T / (c @ prior @ c.T + _QUANTISATION)
+    return KalmanModel(a, force_noise, prior, gain[:, 0] * scale / count, scale)
 
 
 def set_estimator(
@@ -85,7 +127,7 @@ def set_estimator(
 ) -> None:
     """Write model, gain and delay D (in periods, 0 ≤ D ≤ MAX_DELAY) into an ESTIMATOR array (1,).
 
-    count and force_walk are those of `kalman_gain`. Raises ValueError for a delay out of range.
+    count and force_walk are those of `kalman_model`. Raises ValueError for a delay out of range.
     """
     if not 0.0 <= delay <= MAX_DELAY:
         raise ValueError(f"a delay of {delay:g} periods is not between 0 and {MAX_DELAY}")
@@ -94,7 +136,10 @@ def set_estimator(
     estimator["delay_periods"] = whole
     estimator["mass"] = mass
     estimator["coulomb"] = coulomb
-    estimator["gain"] = kalman_gain(mass, viscous, spring, period, count, force_walk)
+    kalman = kalman_model(mass, viscous, spring, period, count, force_walk)
+    estimator["transition"], estimator["force_noise"] = kalman.transition, kalman.force_noise
+    estimator["steady_covariance"], estimator["steady_gain"] = kalman.covariance, kalman.gain
+    estimator["scale"] = kalman.scale
     for name, share in (("full", 1.0), ("before", fraction), ("after", 1.0 - fraction)):
         phi, gamma = zoh(mass, viscous, spring, share * period)
         estimator[name]["duration"] = share * period
@@ -103,8 +148,10 @@ def set_estimator(
 
 
 def reset_estimator(estimator: NDArray[np.void], y: float) -> None:
-    """Start at rest at y, with no bias force and no force in flight."""
-    estimator["y"] = y
+    """Start in the steady state at rest at y, with no bias force and no force in flight."""
+    estimator["settled"], estimator["gap"] = True, 0
+    estimator["gain"] = estimator["steady_gain"]
+    estimator["y"] = estimator["sampled"] = y
     estimator["v"] = estimator["d"] = 0.0
     estimator["in_flight"] = 0.0
 
@@ -128,6 +175,14 @@ def _hold(
 @compiled
 def correct(estimator: Record, y_sample: float) -> None:
     """Correct the state with the sample y[j]: x̂[j|j] = x̂[j|j−1] + L·(y[j] − ŷ[j|j−1])."""
+    if not estimator.settled:
+        _correct_covariance(estimator)
+    if estimator.gap > _LONGEST_GAP:
+        pause = (1 + estimator.gap) * estimator.full[0].duration
+        estimator.v = (y_sample - estimator.sampled) / pause
+        estimator.y = y_sample
+    estimator.gap = 0
+    estimator.sampled = y_sample
     innovation = y_sample - estimator.y
     estimator.y += estimator.gain[0] * innovation
     estimator.v += estimator.gain[1] * innovation
@@ -135,14 +190,51 @@ def correct(estimator: Record, y_sample: float) -> None:
 
 
 @compiled
-def restart_estimate(estimator: Record, y: float, v: float) -> None:
-    """Restart at a sample after a gap, with the mean velocity over the gap.
+def note_missing_sample(estimator: Record) -> None:
+    """Leave the steady state, for a period without a sample; call instead of `correct`."""
+    if estimator.settled:
+        estimator.settled = False
+        estimator.covariance[:] = estimator.steady_covariance
+    estimator.gap += 1
 
-    The steady-state gain is for samples one period apart: after a gap it would turn the whole
-    prediction error into velocity.
-    """
-    estimator.y = y
-    estimator.v = v
+
+@compiled
+def _correct_covariance(estimator: Record) -> None:
+    """Set the gain of a sample, L = P·cᵀ/(c·P·cᵀ + R), and the covariance P − L·c·P after it."""
+    p, scale = estimator.covariance, estimator.scale
+    yy, yv, yd = p[0, 0], p[0, 1], p[0, 2]
+    variance = yy + _QUANTISATION
+    settled = estimator.gap == 0
+    for i, covariance in enumerate((yy, yv, yd)):
+        estimator.gain[i] = covariance / variance * (scale[i] / scale[0])
+        steady = estimator.steady_gain[i]
+        settled = settled and abs(estimator.gain[i] - steady) <= _SETTLED * abs(steady)
+    if settled:
+        estimator.settled = True
+        estimator.gain[:] = estimator.steady_gain
+        return
+    # In the first row (1 − L)·P = R/(c·P·cᵀ + R)·P, without a difference that loses digits.
+    left = _QUANTISATION / variance
+    p[0, 0], p[0, 1], p[0, 2] = left * yy, left * yv, left * yd
+    p[1, 1] -= yv * yv / variance
+    p[1, 2] -= yv * yd / variance
+    p[2, 2] -= yd * yd / variance
+    p[1, 0], p[2, 0], p[2, 1] = p[0, 1], p[0, 2], p[1, 2]
+
+
+@compiled
+def _predict_covariance(estimator: Record) -> None:
+    """Advance the covariance to the next sample, A·P·Aᵀ + Q."""
+    a, p = estimator.transition, estimator.covariance
+    for k in range(3):
+        y, v, d = p[0, k], p[1, k], p[2, k]
+        p[0, k] = a[0, 0] * y + a[0, 1] * v + a[0, 2] * d
+        p[1, k] = a[1, 0] * y + a[1, 1] * v + a[1, 2] * d
+    for i in range(3):
+        y, v, d = p[i, 0], p[i, 1], p[i, 2]
+        p[i, 0] = a[0, 0] * y + a[0, 1] * v + a[0, 2] * d
+        p[i, 1] = a[1, 0] * y + a[1, 1] * v + a[1, 2] * d
+    p[2, 2] += estimator.force_noise
 
 
 @compiled
@@ -178,10 +270,77 @@ def predict(estimator: Record, force: float) -> None:
 
     `force` is what the drive will apply, after saturation and rounding to its unit.
     """
+    if not estimator.settled and estimator.gap < _LONGEST_GAP:
+        _predict_covariance(estimator)
     estimator.y, estimator.v = _over_period(estimator, estimator.y, estimator.v, estimator.d, force)
+    _put_in_flight(estimator, force)
+
+
+@compiled
+def _put_in_flight(estimator: Record, force: float) -> None:
     for age in range(MAX_DELAY, 0, -1):
         estimator.in_flight[age] = estimator.in_flight[age - 1]
     estimator.in_flight[0] = force
+
+
+@compiled
+def stand_still(estimator: Record, periods: int) -> None:
+    """Advance the state over periods without SYNC, in which the drive goes on as it did.
+
+    A torque that waits for a SYNC waits on; one that has taken effect stays.
+    """
+    force = estimator.in_flight[estimator.delay_periods]
+    for _ in range(min(periods, _LONGEST_GAP + 1)):
+        note_missing_sample(estimator)
+        if estimator.gap < _LONGEST_GAP:
+            _predict_covariance(estimator)
+        estimator.y, estimator.v = _hold(
+            estimator, estimator.full[0], estimator.y, estimator.v, force + estimator.d
+        )
+    estimator.gap += max(0, periods - _LONGEST_GAP - 1)
+
+
+@compiled
+def may_lag(estimator: Record) -> bool:
+    """Return True if the forces in flight suffice for samples that are a period older."""
+    whole = estimator.delay_periods + 1
+    return whole < MAX_DELAY or (whole == MAX_DELAY and estimator.before[0].duration == 0.0)
+
+
+@compiled
+def start_lagging(lagging: Record, force: float) -> None:
+    """Turn a copy of the estimator from before a sample that is missing into one that lags.
+
+    It takes the sample that was missing for the next one, and all later samples likewise: D is a
+    period longer. force: as in `predict`, from the period without a sample.
+    """
+    lagging.delay_periods += 1
+    _put_in_flight(lagging, force)
+
+
+@compiled
+def end_lag(estimator: Record) -> None:
+    """Advance an estimator whose samples lag by a period, as the next one does no longer."""
+    estimator.delay_periods -= 1
+    note_missing_sample(estimator)
+    if estimator.gap < _LONGEST_GAP:
+        _predict_covariance(estimator)
+    n = estimator.delay_periods
+    y, v, d = estimator.y, estimator.v, estimator.d
+    before = estimator.in_flight[n + 1] if n < MAX_DELAY else 0.0
+    y, v = _hold(estimator, estimator.before[0], y, v, before + d)
+    estimator.y, estimator.v = _hold(
+        estimator, estimator.after[0], y, v, estimator.in_flight[n] + d
+    )
+
+
+@compiled
+def surprise(estimator: Record, y_sample: float) -> float:
+    """Return the negative logarithm of a sample's likelihood, bounded; call before `correct`."""
+    p = estimator.steady_covariance if estimator.settled else estimator.covariance
+    variance = p[0, 0] + _QUANTISATION
+    innovation = (y_sample - estimator.y) / estimator.scale[0]
+    return 0.5 * (min(innovation * innovation / variance, _IMPOSSIBLE) + math.log(variance))
 
 
 @compiled

@@ -62,7 +62,7 @@ def _plain_strike() -> None:
     """The same loop as it is written in NumPy: matrices, a Kalman filter, half_sample."""
     from scipy.linalg import expm
 
-    from canwall.walls.estimator import kalman_gain
+    from canwall.walls.estimator import kalman_model
 
     settings = _struck("half_sample")
     mechanics, period = settings.mechanics, settings.bus.cycle_s
@@ -76,7 +76,7 @@ def _plain_strike() -> None:
     phi, gamma = flow[:2, :2], flow[:2, 2]
     contact = np.array([[0.0, 1.0], [-stiffness / mass, -viscous / mass]])
     half = expm(contact * 0.5 * period)
-    gain = kalman_gain(mass, viscous, 0.0, period, count, 0.2)
+    gain = kalman_model(mass, viscous, 0.0, period, count, 0.2).gain
     x, estimate, sent = np.array([0.03, 0.0]), np.array([0.03, 0.0, 0.0]), 0.0
     for j in range(_STRIKE):
         y = np.floor(x[0] / count + 0.5) * count

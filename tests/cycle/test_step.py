@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rig import settings_with
 
 from canwall.config import Settings
-from canwall.cycle import Trip, make_cycle, run_laws, set_wall, step
+from canwall.cycle import Trip, fade_in, make_cycle, run_laws, set_wall, step
 from canwall.cycle.state import start_at
 from canwall.drive import DriveSetup, Field, PdoLayout
 from canwall.record import ROW, Phase
@@ -185,8 +185,13 @@ def test_torque_is_held_to_its_limit() -> None:
 # Missing TPDOs
 
 
+#: A handle that no torque moves.
+HEAVY = {"mechanics.inertia_kg_m2": 1e6}
+
+
 def test_missing_tpdos_hold_then_ramp_then_trip() -> None:
-    wall = Wall({"limits.hold_cycles": 2, "limits.ramp_cycles": 4})
+    wall = Wall({"limits.hold_cycles": 2, "limits.ramp_cycles": 4} | HEAVY)
+    start_at(wall.cycle, -20)
     assert wall.at(-20) == 1000
     assert [wall.missing() for _ in range(5)] == [1000, 1000, 750, 500, 250]
     assert wall.trip() == Trip.NONE
@@ -196,13 +201,63 @@ def test_missing_tpdos_hold_then_ramp_then_trip() -> None:
 
 
 def test_tpdo_that_comes_back_ends_the_ramp() -> None:
-    wall = Wall({"limits.hold_cycles": 1, "limits.ramp_cycles": 10})
+    wall = Wall({"limits.hold_cycles": 1, "limits.ramp_cycles": 10} | HEAVY)
+    start_at(wall.cycle, -20)
     wall.at(-20)
     assert [wall.missing() for _ in range(3)] == [1000, 900, 800]
     assert not wall.row["received"][0]
     assert wall.at(-20) == 1000
     assert [wall.missing() for _ in range(2)] == [1000, 900]
     assert wall.cycle["missed_tpdo"][0] == 5
+
+
+def gliding(counts_per_cycle: int, at: int, overrides: dict[str, Any]) -> Wall:
+    """A handle with a constant speed, unimpressed by torques, which the estimator knows."""
+    wall = Wall({"limits.position_rad": [-9.0, 9.0]} | HEAVY | overrides)
+    start_at(wall.cycle, at)
+    wall.cycle["estimator"]["v"] = counts_per_cycle  # 1 mrad in 1 ms
+    return wall
+
+
+def test_law_goes_on_at_the_predicted_position() -> None:
+    # Of a law that uses the sample of the position only.
+    inwards = gliding(-3, 4, {"limits.hold_cycles": 3, "limits.ramp_cycles": 10})
+    assert inwards.at(4) == 0
+    assert [inwards.missing() for _ in range(3)] == [0, 100, 250]
+    # From then on it only falls.
+    assert inwards.missing() == 225
+    outwards = gliding(3, -14, {"limits.hold_cycles": 2, "limits.ramp_cycles": 10})
+    assert outwards.at(-14) == 700
+    assert [outwards.missing() for _ in range(5)] == [550, 400, 250, 100, 0]
+
+
+def test_rate_of_the_torque_is_limited_without_tpdos() -> None:
+    wall = gliding(-3, 4, {"limits.torque_rate_nm_per_s": 60.0, "limits.hold_cycles": 3})
+    wall.at(4)
+    assert [wall.missing() for _ in range(3)] == [0, 60, 120]
+
+
+def test_memories_of_a_law_are_those_of_its_samples() -> None:
+    seen, blind = (gliding(3, -14, {"wall.law": "two_step"}) for _ in range(2))
+    seen.at(-14), blind.at(-14)
+    wall_before = blind.cycle["rendered"]["wall"]["memory"].copy()
+    blind.missing()
+    assert (blind.cycle["rendered"]["wall"]["memory"] == wall_before).all()
+
+
+def test_torque_is_held_while_a_wall_fades_in() -> None:
+    wall = gliding(3, -14, {})
+    fade_in(wall.cycle, 9)
+    assert wall.at(-14) == 70
+    assert [wall.missing() for _ in range(2)] == [70, 70]
+
+
+def test_gap_that_begins_before_the_wall_does_not_give_a_torque_of_no_law() -> None:
+    wall = gliding(-3, -14, {})
+    wall.cycle["phase"] = Phase.ENABLING
+    wall.at(-14), wall.missing()
+    wall.cycle["phase"] = Phase.RENDERING
+    assert wall.missing() == 700 + 2 * 150
 
 
 def test_no_hold_at_all() -> None:

@@ -16,11 +16,12 @@ from canwall.walls import (
     MAX_DELAY,
     actuation_state,
     correct,
+    note_missing_sample,
     predict,
     reset_estimator,
     set_estimator,
 )
-from canwall.walls.estimator import kalman_gain
+from canwall.walls.estimator import kalman_model
 
 Array = NDArray[np.float64]
 
@@ -43,7 +44,9 @@ class Model:
 MODELS = (Model(), Model(viscous=0.0261, spring=3.2), Model(mass=0.6, viscous=6.5, spring=135.0))
 
 
-def make_estimator(model: Model, delay: float, walk: float = WALK) -> NDArray[np.void]:
+def make_estimator(
+    model: Model, delay: float, walk: float = WALK, period: float = PERIOD
+) -> NDArray[np.void]:
     estimator = np.zeros(1, ESTIMATOR)
     set_estimator(
         estimator,
@@ -51,7 +54,7 @@ def make_estimator(model: Model, delay: float, walk: float = WALK) -> NDArray[np
         model.viscous,
         model.spring,
         model.coulomb,
-        PERIOD,
+        period,
         COUNT,
         walk,
         delay,
@@ -68,7 +71,7 @@ def augmented(model: Model) -> Array:
 
 
 def gain_of(model: Model, walk: float = WALK) -> Array:
-    return kalman_gain(model.mass, model.viscous, model.spring, PERIOD, COUNT, walk)
+    return kalman_model(model.mass, model.viscous, model.spring, PERIOD, COUNT, walk).gain
 
 
 def bandwidth(mass: float, walk: float) -> float:
@@ -116,7 +119,7 @@ def test_gain_does_not_depend_on_units() -> None:
     model = MODELS[1]
     kilogram, metre, second = 1e3, 1e2, 1e6
     newton = kilogram * metre / second**2
-    scaled = kalman_gain(
+    scaled = kalman_model(
         model.mass * kilogram,
         model.viscous * kilogram / second,
         model.spring * kilogram / second**2,
@@ -125,7 +128,7 @@ def test_gain_does_not_depend_on_units() -> None:
         WALK * newton / math.sqrt(second),
     )
     expected = gain_of(model) * np.array([1.0, 1.0 / second, newton / metre])
-    np.testing.assert_allclose(scaled, expected, rtol=1e-7)
+    np.testing.assert_allclose(scaled.gain, expected, rtol=1e-7)
 
 
 class Bench:
@@ -252,6 +255,87 @@ def test_correction_is_the_gain_times_the_innovation() -> None:
     assert estimator["y"][0] == pytest.approx(0.25 + 0.01 * gain[0], rel=1e-12)
     assert estimator["v"][0] == pytest.approx(0.01 * gain[1], rel=1e-10)
     assert estimator["d"][0] == pytest.approx(0.01 * gain[2], rel=1e-10)
+
+
+class Riccati:
+    """The covariance of [y, ẏ, d] by the textbook recursion, in extended precision."""
+
+    def __init__(self, model: Model, period: float, walk: float) -> None:
+        phi, gamma = zoh(model.mass, model.viscous, model.spring, period)
+        self.a = np.eye(3, dtype=np.longdouble)
+        self.a[:2, :2], self.a[:2, 2] = phi, gamma
+        self.noise = np.diag(np.array([0.0, 0.0, walk**2 * period], np.longdouble))
+        self.r = np.longdouble(COUNT) ** 2 / 12
+        self.p = np.diag(np.array([COUNT, 1.0, 1.0], np.longdouble) ** 2)
+        for _ in range(5000):
+            self.step(True)
+
+    def step(self, received: bool) -> Array:
+        """Advance to the next sample; return the gain of this one."""
+        gain = self.p[:, 0] / (self.p[0, 0] + self.r)
+        if received:
+            rest = np.eye(3) - np.outer(gain, [1.0, 0.0, 0.0])
+            # Joseph's form keeps it symmetrical and positive.
+            self.p = rest @ self.p @ rest.T + self.r * np.outer(gain, gain)
+        self.p = self.a @ self.p @ self.a.T + self.noise
+        return gain.astype(float)
+
+
+def losses(seed: int, cycles: int, share: float, burst: float) -> NDArray[np.bool_]:
+    """Gilbert's losses: bursts of a mean length, a share of all samples."""
+    random = np.random.default_rng(seed)
+    lost, now = np.zeros(cycles, bool), False
+    for j, number in enumerate(random.random(cycles)):
+        now = number >= 1.0 / burst if now else number < share / (1.0 - share) / burst
+        lost[j] = now
+    return lost
+
+
+@pytest.mark.parametrize("period", [2.5e-4, 1e-3, 1e-2])
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize(("share", "burst"), [(0.05, 1.2), (0.5, 2.0), (0.3, 8.0)])
+def test_gain_after_missing_samples_is_that_of_the_riccati_recursion(
+    model: Model, period: float, share: float, burst: float
+) -> None:
+    estimator = make_estimator(model, 1.0, period=period)
+    reset_estimator(estimator, 0.0)
+    riccati = Riccati(model, period, WALK)
+    for missing in losses(1, 300, share, burst):
+        if missing:
+            note_missing_sample(estimator[0])
+        else:
+            correct(estimator[0], 0.0)
+        expected = riccati.step(not missing)
+        if not missing:
+            np.testing.assert_allclose(estimator["gain"][0], expected, rtol=1e-4)
+        predict(estimator[0], 0.0)
+
+
+@pytest.mark.parametrize("period", [2.5e-4, 1e-3, 1e-2])
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("gap", [1, 5, 40, 10_000])
+def test_gain_returns_to_exactly_the_steady_state(model: Model, period: float, gap: int) -> None:
+    estimator = make_estimator(model, 1.0, period=period)
+    reset_estimator(estimator, 0.0)
+    for _ in range(gap):
+        note_missing_sample(estimator[0])
+        predict(estimator[0], 0.0)
+    assert not estimator["settled"][0]
+    for _ in range(2000):
+        correct(estimator[0], 0.0)
+        assert np.isfinite(estimator["gain"]).all()
+        predict(estimator[0], 0.0)
+    assert estimator["settled"][0]
+    assert (estimator["gain"] == estimator["steady_gain"]).all()
+
+
+def test_without_gaps_the_filter_never_leaves_the_steady_state() -> None:
+    estimator = make_estimator(MODELS[1], 1.0)
+    reset_estimator(estimator, 0.0)
+    for j in range(100):
+        correct(estimator[0], 1e-3 * j)
+        predict(estimator[0], 0.0)
+        assert estimator["settled"][0]
 
 
 def test_reset_clears_state_and_forces_in_flight() -> None:
