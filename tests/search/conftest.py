@@ -1,6 +1,3 @@
-"""The search, see `__main__`: modules of other folders of tests, which it uses."""
+"""The search, see `__main__`."""
 
-import sys
-from pathlib import Path
-
-sys.path += [str(Path(__file__).parents[1] / folder) for folder in ("run", "simdrive")]
+import other_tests  # noqa: F401
