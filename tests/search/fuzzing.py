@@ -79,8 +79,9 @@ def instrument(beginnings: tuple[str, ...], instrument_function: Callable[[Any],
     ]
     for module in modules:
         for thing in list(vars(module).values()):
-            ours = isinstance(thing, types.FunctionType | type)
-            if ours and thing.__module__ == module.__name__:
+            # An instance may refuse to be asked for its class.
+            described = issubclass(type(thing), types.FunctionType | type)
+            if described and thing.__module__ == module.__name__:
                 for function in _functions(thing):
                     instrument_function(function)
 
