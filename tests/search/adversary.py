@@ -5,6 +5,7 @@ forged is another master: SDO requests and RPDOs that nobody has sent. Such a on
 has no senders, and what it leaves behind is its own affair.
 """
 
+import types
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -12,8 +13,6 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, Literal, TypeAlias, cast
 from unittest.mock import patch
-
-import types
 
 import canopen.sdo
 import rig

@@ -3,6 +3,7 @@
 import threading
 from collections import Counter
 from collections.abc import Callable
+from typing import ClassVar
 
 from adversary import (
     KINDS,
@@ -11,13 +12,21 @@ from adversary import (
     Frame,
     Master,
     Pair,
+    fast_duels,
     forged_to_drive,
     forged_to_master,
 )
+from hypothesis import HealthCheck, seed, settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    rule,
+    run_state_machine_as_test,
+)
 
-_CYCLES = 400
+_CYCLES, _STEPS = 400, 30
 #: Times that a master may stand still [s]: shorter and longer than the watchdog waits.
 _STALLS_S = (0.1, 5.0, 29.0, 31.0, 100.0)
 
@@ -58,8 +67,10 @@ class Belief(RuleBasedStateMachine):
     """Master and drive, frame by frame; rules are what may happen to either, or on the bus."""
 
     #: Pairs that were seen, and how often; the machines so far.
-    pairs: Counter[Pair] = Counter()
-    machines = 0
+    pairs: ClassVar[Counter[Pair]] = Counter()
+    machines: ClassVar[int] = 0
+
+    tell: ClassVar[Callable[[int], None]] = staticmethod(lambda done: None)
 
     @initialize(native=st.booleans(), phase=st.sampled_from(["set up", "enabling", "rendering"]))
     def begin(self, native: bool, phase: str) -> None:
@@ -117,6 +128,7 @@ class Belief(RuleBasedStateMachine):
             self.thread.step()
         Belief.pairs.update(self.master.pairs)
         Belief.machines += 1
+        Belief.tell(Belief.machines)
         try:
             self.nothing_was_wrong()
             self.duel.settle()
@@ -126,3 +138,33 @@ class Belief(RuleBasedStateMachine):
     def _do(self, act: Act) -> None:
         self.duel.adversary.plan([act])
         self.go_on(1)
+
+
+def pairs(
+    first: int, examples: int, tell: Callable[[int], None] = lambda done: None
+) -> dict[str, object]:
+    """Play so many machines, and return the pairs that were reached, and how often.
+
+    Args:
+        first: seed.
+        examples: number of machines.
+        tell: called with the machines so far.
+    """
+    Belief.pairs, Belief.machines = Counter(), 0
+    Belief.tell = staticmethod(tell)
+    given = settings(
+        max_examples=examples,
+        stateful_step_count=_STEPS,
+        deadline=None,
+        database=None,
+        suppress_health_check=list(HealthCheck),
+    )
+    with fast_duels():
+        run_state_machine_as_test(seed(first)(Belief), settings=given)
+    return {
+        "machines": Belief.machines,
+        "pairs": {
+            f"{state}, {'torque' if torque else 'no torque'}; master: {belief}": count
+            for (state, torque, belief), count in Belief.pairs.most_common()
+        },
+    }

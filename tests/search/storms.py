@@ -84,14 +84,14 @@ class Storms:
         runs: runs, of which so many ended by a trip.
         contacts: with the wall.
         faults: of drive and host.
-        energy_out_max_j: most that a wall put out in one contact.
+        largest_per_mille: largest torque of a drive.
         ended: runs by how they ended.
     """
 
     runs: int = 0
     contacts: int = 0
     faults: int = 0
-    energy_out_max_j: float = 0.0
+    largest_per_mille: int = 0
     ended: dict[str, int] = field(default_factory=dict)
 
 
@@ -163,8 +163,8 @@ def _storm(done: Storms, number: int, witnesses: list[Witness]) -> None:
     done.ended[kind] = done.ended.get(kind, 0) + 1
     if result is not None:
         done.contacts += result.summary["contacts"]
-        energy = result.summary["energy_out_max_j"]
-        done.energy_out_max_j = max(done.energy_out_max_j, round(energy, 4))
+    largest = max(map(abs, witnesses[0].torques), default=0)
+    done.largest_per_mille = max(done.largest_per_mille, largest)
 
 
 def _settings(chance: random.Random) -> Settings:

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from unittest.mock import patch
 
-import canwall.cli.ending
 import numpy as np
 from adversary import Act, Duel, Master, acts, fast_duels
 from hypothesis import given, settings
@@ -22,6 +21,7 @@ from rig import eds_without
 from simdrive_bench import EDS, PERIOD_S
 from test_any_frames import Event, Fuzzed, event_lists, without_enabling
 
+import canwall.cli.ending
 import canwall.run
 import canwall.simdrive.communication.dictionary as drive_dictionary
 from canwall import config
