@@ -218,7 +218,7 @@ class Promises(_Generated):
         head = [f"{low:g}–{high:g}" for low, high in itertools.pairwise(bins)]
         yield from ("", "## Time to zero torque", "")
         yield from (
-            "Milliseconds from the signal in contact to the drive's own end, as the witness saw it;",
+            "Milliseconds from the signal in contact to the drive's end, as the witness saw it;",
             "the watchdogs wait for 500 ms since the last frame of the master that counts.",
             "",
         )

@@ -124,7 +124,7 @@ PARTS = {
     "records": Part(
         partial(_fuzz, "records"),
         50_000,
-        60,
+        40,
         "Any record of a run is drawn, or refused with one line.",
     ),
     "journals": Part(
@@ -136,7 +136,7 @@ PARTS = {
     "belief": Part(
         belief.pairs,
         5_000,
-        30,
+        100,
         "No pair of a drive's state and its master's belief has a torque and no master in its"
         " cycle, whatever is lost, late, doubled, reordered or forged.",
     ),

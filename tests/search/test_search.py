@@ -11,10 +11,14 @@ import kills
 import long_runs
 import pytest
 import storms
+from adversary import Act, Duel, Master, TorqueError, fast_duels
 from fork_server import ForkedPopen
 from fuzzing import fuzz
 from parts import PARTS
 from targets import TARGETS
+
+import canwall.drive.setup
+from canwall.drive.watchdog import NO_WATCHDOG
 
 SEED = 1
 
@@ -80,8 +84,15 @@ def test_figures_are_kept(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_search_for_something_unknown() -> None:
-    words = [sys.executable, str(Path(__file__).parent), "belive"]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert "no part 'belive'; there are frames into the drive, " in done.stderr
+def test_torque_without_a_master_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The search can find something: a drive whose watchdog is not set."""
+    monkeypatch.setattr(canwall.drive.setup, "arm", lambda *given: NO_WATCHDOG)
+    with fast_duels():
+        duel = Duel()
+        try:
+            duel.adversary.plan([Act("gone", after=600)])
+            Master(duel, cycles=200).run()
+            with pytest.raises(TorqueError, match="and no master in its cycle"):
+                duel.settle()
+        finally:
+            duel.close()
