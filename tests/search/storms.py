@@ -73,6 +73,8 @@ _GRAVE: tuple[dict[str, Any], ...] = (
     {"kind": "bus_off"},
     {"kind": "babbling", "can_id": 0x185},
 )
+#: Rated torque of the drive of config/sim.toml [N·m], and its 0x6072 [per mille].
+_RATED_NM, _DRIVE_LIMIT = 0.637, 3000
 _HOST = ("none", "none", "none", "stall", "signal", "writer killed")
 
 
@@ -234,14 +236,16 @@ def _check(
     wrong = []
     if witness.torque():
         wrong.append(f"{witness.torque()} per mille are left")
-    # The limit in per mille of the rated torque of config/sim.toml.
-    limit = settings.limits.torque_nm / 0.637 * 1000.0
-    if max(map(abs, witness.torques), default=0) > limit + 1.0:
-        wrong.append(f"{max(map(abs, witness.torques))} per mille, {limit:.0f} is the limit")
+    # The drive's own limit: what it gets may be corrupted on the way.
+    if max(map(abs, witness.torques), default=0) > _DRIVE_LIMIT:
+        wrong.append(f"{max(map(abs, witness.torques))} per mille in the drive")
     if result is not None and host != "writer killed":
         record = Record(folder)
         if not np.array_equal(record.column("j"), np.arange(record.summary["cycles"])):
             wrong.append("cycles are missing in the record")
+        largest = np.abs(record.column("torque_cmd_per_mille").astype(int)).max(initial=0)
+        if largest > settings.limits.torque_nm / _RATED_NM * 1000.0 + 1.0:
+            wrong.append(f"{largest} per mille commanded, beyond limits.torque_nm")
         complete = record.summary["cycles"] >= round(_DURATION_S / settings.bus.cycle_s)
         if not (complete or result.outcome.trips or result.outcome.interrupted):
             wrong.append("ended without a word")
