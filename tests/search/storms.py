@@ -1,9 +1,9 @@
 """Storms: faults of the drive and of the host over each other, contact after contact."""
 
 import contextlib
-import os
 import random
 import signal
+import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -150,7 +150,8 @@ def _storm(done: Storms, number: int, witnesses: list[Witness]) -> None:
         folder = Path(temporary) / "run"
         ended, result = "", None
         try:
-            result = run(settings, folder, stopped=trouble, progress=trouble.note)
+            with trouble.knows_writers():
+                result = run(settings, folder, stopped=trouble, progress=trouble.note)
             ended = "tripped" if result.outcome.trips else "completed"
             if result.outcome.interrupted:
                 ended = "stopped"
@@ -194,7 +195,20 @@ class _Host:
 
     def __init__(self, kind: str, at_s: float) -> None:
         self._kind, self._at_s = kind, at_s
+        self._writers: list[subprocess.Popen[bytes]] = []
         self._now_s = 0.0
+
+    @contextlib.contextmanager
+    def knows_writers(self) -> Iterator[None]:
+        """Take the writers of the records that are begun meanwhile."""
+        begin = Recorder.begin
+
+        def noted(recorder: Recorder, *given: Any) -> None:
+            self._writers.append(recorder._writer)
+            begin(recorder, *given)
+
+        with patch.object(Recorder, "begin", noted):
+            yield
 
     def note(self, now_s: float, end_s: float | None) -> None:
         """Take the time."""
@@ -208,20 +222,8 @@ class _Host:
             elif kind == "signal":
                 signal.raise_signal(signal.SIGINT)
             elif kind == "writer killed":
-                for child in _children():
-                    os.kill(child, signal.SIGKILL)
+                self._writers[-1].kill()
         return False
-
-
-def _children() -> list[int]:
-    """Return the writers of records that this process has started."""
-    own = os.getpid()
-    children = map(int, Path(f"/proc/{own}/task/{own}/children").read_text().split())
-    return [
-        child
-        for child in children
-        if b"canwall.record.writer" in Path(f"/proc/{child}/cmdline").read_bytes()
-    ]
 
 
 def _check(
