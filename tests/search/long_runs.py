@@ -21,7 +21,7 @@ from canwall.record import ROW
 #: Interval of the samples of a run [s], and the part of the run before which nothing counts.
 _SAMPLE_S, _WARM_UP = 0.2, 0.3
 #: Growth after the warm-up that is none of the cycles', but of the allocator [bytes].
-_NOISE = 32 << 20
+_NOISE = 128 << 20
 _PAGE = os.sysconf("SC_PAGESIZE")
 _INTERVAL_S = 1.0
 
