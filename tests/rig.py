@@ -131,13 +131,16 @@ class Rig:
                 self.settings.drive, self.settings.simulation, self.settings.bus.cycle_s
             )
         )
-        drive = cast(simdrive.SimulatedDrive, self.tampering)
-        self.runner = simdrive.BusRunner(drive, self.drive_bus)
+        self.runner = self.switch_on(cast(simdrive.SimulatedDrive, self.tampering))
         self.link = Link(self.bus, idle=self.runner.poll)
         self.link.log = self._note
         self.frames: list[tuple[int, bytes]] = []
         dictionary = load_eds(self.settings.drive.eds, 5, REQUIRED_OBJECTS)
         self.node = DriveNode(self.link, 5, dictionary, self.settings.drive.sdo_timeout_s)
+
+    def switch_on(self, drive: simdrive.SimulatedDrive) -> simdrive.BusRunner:
+        """Put the drive onto its end of the bus."""
+        return simdrive.BusRunner(drive, self.drive_bus)
 
     def _note(self, time_s: float, message: can.Message, received: bool) -> None:
         self.frames.append((message.arbitration_id, bytes(message.data)))

@@ -1,6 +1,8 @@
 """Tables that are read from the code while the site is built, so that they cannot go stale."""
 
 import inspect
+import itertools
+import json
 import types
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -177,10 +179,84 @@ class SweepMeasures(_Generated):
         yield from _table(("variable", "unit", "meaning"), rows)
 
 
+_PROMISES = Path(__file__).parents[1] / "promises.json"
+
+
+class Promises(_Generated):
+    """What the last search has tried, and its figures: `{promises}`, from promises.json."""
+
+    def lines(self) -> Iterator[str]:
+        """A table of the parts, then of the times to zero torque, then of the pairs."""
+        parts = json.loads(_PROMISES.read_text())
+        played = parts.pop("cases", {"figures": {}})
+        rows = [
+            (promise, case["figure"], f"`scripts/test {case['tests']}`")
+            for promise, case in played["figures"].items()
+        ]
+        rows += [self._row(name, part) for name, part in parts.items()]
+        yield from _table(("promise", "last figures", "command"), rows)
+        yield from self._times(parts.get("kills", {}).get("figures", {}))
+        yield from self._pairs(parts.get("belief", {}).get("figures", {}))
+
+    @staticmethod
+    def _row(name: str, part: dict[str, Any]) -> tuple[str, str, str]:
+        figures = [
+            f"{key.replace('_', ' ')} {_figure(value)}"
+            for key, value in part["figures"].items()
+            if not isinstance(value, dict) and key != "bins_ms"
+        ]
+        searched = f"{part['date']}, seed {part['seed']}"
+        quoted = f'"{name}"' if " " in name else name
+        command = f"`scripts/search {quoted} --seed {part['seed']}`"
+        return part["promise"], f"{'; '.join(figures)} ({searched})", command
+
+    @staticmethod
+    def _times(kills: dict[str, Any]) -> Iterator[str]:
+        if not kills.get("in contact"):
+            return
+        bins = kills["bins_ms"]
+        head = [f"{low:g}–{high:g}" for low, high in itertools.pairwise(bins)]
+        yield from ("", "## Time to zero torque", "")
+        yield from (
+            "Milliseconds from the signal in contact to the drive's end, as the witness saw it;",
+            "the watchdogs wait for 500 ms since the last frame of the master that counts.",
+            "",
+        )
+        rows = []
+        for name, times in kills["in contact"].items():
+            counts = [str(count or "") for count in times["histogram"]]
+            rows.append((name, f"{times['median_ms']:g}", f"{times['longest_ms']:g}", *counts))
+        yield from _table(("signal, watchdog", "median", "longest", *head), rows)
+
+    @staticmethod
+    def _pairs(belief: dict[str, Any]) -> Iterator[str]:
+        if not belief:
+            return
+        yield from ("", "## Pairs of drive and master", "")
+        yield from (
+            "What the drive was, what its master took it for, and how often the search saw it. At",
+            "the end of each the drive is left alone for longer than its watchdog waits; no torque",
+            "was left.",
+            "",
+        )
+        rows = []
+        for pair, count in belief["pairs"].items():
+            drive, _, master = pair.partition("; master: ")
+            rows.append((drive, master, str(count)))
+        yield from _table(("drive", "master", "seen"), rows)
+
+
+def _figure(value: Any) -> str:
+    if isinstance(value, list):
+        return " to ".join(map(_figure, value))
+    return f"{value:,}".replace(",", " ") if isinstance(value, int) else f"{value:g}"
+
+
 def setup(app: "Sphinx") -> dict[str, Any]:
     """Register the directives."""
     app.add_directive("canwall-commands", Commands)
     app.add_directive("configuration-keys", ConfigurationKeys)
     app.add_directive("recorded-columns", RecordedColumns)
     app.add_directive("sweep-measures", SweepMeasures)
+    app.add_directive("promises", Promises)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

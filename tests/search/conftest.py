@@ -1,0 +1,3 @@
+"""The search, see `__main__`."""
+
+import other_tests  # noqa: F401
