@@ -1,10 +1,33 @@
 """Output of the commands: the two consoles, error lines, progress."""
 
+import os
+from typing import Any
+
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-console = Console()
-errors = Console(stderr=True, soft_wrap=True, highlight=False)
+
+class _LastingConsole(Console):
+    """Console that outlasts its file: a full disk or a closed pipe does not end a command."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        try:
+            super().print(*objects, **options)
+        except OSError as error:
+            # What is left in buffers goes nowhere, at the end of Python as well.
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, 2 if self.stderr else 1)
+            os.close(nowhere)
+            if not self.stderr and not isinstance(error, BrokenPipeError):
+                say(f"standard output cannot be written: {error.strerror}")
+
+    def on_broken_pipe(self) -> None:
+        """Leave it to `print`: rich would end the command."""
+        raise BrokenPipeError
+
+
+console = _LastingConsole()
+errors = _LastingConsole(stderr=True, soft_wrap=True, highlight=False)
 
 
 def say(text: str) -> None:
