@@ -56,6 +56,9 @@ def write_result(
     summary = summarise(signals, settings, axis.setup.units, referent)
     summary |= {
         "missed_tpdo": int(axis.cycle["missed_tpdo"][0]),
+        "late_tpdo": int(axis.frames["late_tpdo"][0]),
+        "tpdo_lag_cycles": int(axis.cycle["lag"][0]),
+        "skipped_sync": int(axis.cycle["skipped_sync"][0]),
         "late_rpdo": axis.late_rpdo,
         "error_frames": monitor.error_frames,
         "trips": outcome.trips,
@@ -75,7 +78,17 @@ def write_result(
     folder.summary.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     if outcome.trip_cycle is not None:
         folder.write_trip(signals, outcome.trip_cycle)
-    return RunResult(folder, summary, outcome, notes, remarks)
+    return RunResult(folder, summary, outcome, notes, [*remarks, *_remarks_on_lag(axis)])
+
+
+def _remarks_on_lag(axis: WallAxis) -> list[str]:
+    lag = int(axis.cycle["lag"][0])
+    if not lag:
+        return []
+    return [
+        f"TPDOs have been late by a cycle since one was missing: the delay is {axis.delay + lag:g} "
+        f"cycles, for which the estimator allows; look to the drive's timing and the bus load"
+    ]
 
 
 def _real_time_summary(axis: WallAxis, exchange: Exchange) -> dict[str, Any]:
