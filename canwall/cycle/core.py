@@ -38,6 +38,9 @@ INBOX = 1 << 12
 BACKLOG = 0.5
 
 _OPERATIONAL = 5
+
+#: In simulated time, the wait for a TPDO that is not there when the timeout has passed.
+_SECOND_LOOK_NS = 50_000_000
 _ID_BITS = CAN_ERR - 1
 
 
@@ -148,6 +151,7 @@ CORE = np.dtype(
         ("timeout_ns", "i8"),
         ("missing_timeout_ns", "i8"),
         ("tpdo_until_ns", "i8"),
+        ("looked_again", "?"),  # for TPDOs, after the timeout
         ("answered", "i8"),  # the drive whose RPDO is being sent
         ("drives", "u8"),
         ("drives_length", "i8"),
@@ -348,6 +352,7 @@ def _begin_cycle(core: Record, sync_ns: int, since_ns: int) -> None:
         if cycle.missed_in_a_row:
             timeout = core.missing_timeout_ns
     core.tpdo_until_ns = sync_ns + timeout
+    core.looked_again = core.real_time
     core.stage = _TPDO_AWAITED
 
 
@@ -358,6 +363,10 @@ def _await_tpdos(core: Record, now_ns: int) -> int:
     drives = elements(core.drives, core.drives_length, DRIVE_FRAMES)
     for k in range(len(drives)):
         if drives[k].awaited:
+            if now_ns >= core.tpdo_until_ns and not core.looked_again:
+                # In simulated time it is the machine that was away, not the TPDO.
+                core.looked_again = True
+                core.tpdo_until_ns = now_ns + _SECOND_LOOK_NS
             if now_ns < core.tpdo_until_ns:
                 core.until_ns = core.tpdo_until_ns
                 return _FRAME

@@ -59,6 +59,9 @@ def write_result(
     summary |= {
         "cut_off": False,
         "missed_tpdo": int(axis.cycle["missed_tpdo"][0]),
+        "late_tpdo": int(axis.frames["late_tpdo"][0]),
+        "tpdo_lag_cycles": int(axis.cycle["lag"][0]),
+        "skipped_sync": int(axis.cycle["skipped_sync"][0]),
         "late_rpdo": axis.late_rpdo,
         "error_frames": monitor.error_frames,
         "trips": outcome.trips,
@@ -81,13 +84,25 @@ def write_result(
             folder.write_trip(signals, outcome.trip_cycle)
     except RecordError as error:
         notes.append(str(error))  # the trip is told nevertheless
-    return RunResult(folder, summary, outcome, notes, remarks, not_restored)
+    return RunResult(
+        folder, summary, outcome, notes, [*remarks, *_remarks_on_lag(axis)], not_restored
+    )
 
 
 def judged(signals: "pa.Table", settings: Settings, units: DriveUnits) -> dict[str, Any]:
     """Return what the summary has from the rows, judged against the continuous referent."""
     wall = (numbers(signals, name) for name in ("stiffness", "damping", "wall_position_rad"))
     return summarise(signals, settings, units, referent_positions(settings, *wall))
+
+
+def _remarks_on_lag(axis: WallAxis) -> list[str]:
+    lag = int(axis.cycle["lag"][0])
+    if not lag:
+        return []
+    return [
+        f"TPDOs have been late by a cycle since one was missing: the delay is {axis.delay + lag:g} "
+        f"cycles, for which the estimator allows; look to the drive's timing and the bus load"
+    ]
 
 
 def _real_time_summary(axis: WallAxis, exchange: Exchange) -> dict[str, Any]:

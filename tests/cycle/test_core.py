@@ -292,6 +292,64 @@ def test_late_rpdo_is_counted_against_the_next_sync() -> None:
     assert late == [(0, 0), (0, 0), (1, 1), (2, 2), (2, 0)]
 
 
+@pytest.mark.parametrize("late", [0, 400_000, 600_000, 3_400_000, 3_600_000])
+def test_master_that_stood_still_keeps_to_the_grid(late: int) -> None:
+    bench = Bench(real_time=True)
+    bench.begin()
+    bench.proceed()
+    bench.now_ns += 100_000
+    bench.take(TPDO + 5, tpdo())
+    bench.now_ns = START_NS + PERIOD_NS + late
+    want = bench.begin()
+    while not (want == Want.FRAME and bench.sent[-1] == SYNC):
+        bench.now_ns += 10_000
+        want = bench.proceed()
+    sent_ns = bench.frames[-1][0]
+    assert abs((sent_ns - START_NS + PERIOD_NS // 2) % PERIOD_NS - PERIOD_NS // 2) <= 410_000
+    assert sent_ns - (START_NS + PERIOD_NS + late) < PERIOD_NS
+    skipped = round((sent_ns - START_NS) / PERIOD_NS) - 1
+    assert bench.axes[0].cycle["skipped"][0] == skipped
+
+
+def test_no_sync_is_skipped_in_simulated_time(bench: Bench) -> None:
+    for _ in range(3):
+        bench.cycle()
+        bench.now_ns += 7 * PERIOD_NS
+        assert bench.axes[0].cycle["skipped_sync"][0] == 0
+
+
+def test_external_sync_is_skipped_by_the_kernels_stamp() -> None:
+    bench = Bench(real_time=True, external_sync=True)
+    for stamp, skipped in ((1, 0), (2, 0), (5, 2), (6, 2)):
+        bench.begin()
+        bench.now_ns += 50 * PERIOD_NS  # frames that have waited for the master
+        bench.take(SYNC, stamp_ns=START_NS + stamp * PERIOD_NS)
+        bench.take(TPDO + 5, tpdo())
+        assert bench.axes[0].cycle["skipped_sync"][0] == skipped
+
+
+def test_tpdo_after_its_window_is_a_late_one() -> None:
+    bench = Bench(real_time=True)
+    bench.begin()
+    bench.proceed()
+    bench.now_ns = int(bench.core["until_ns"][0])
+    assert bench.proceed() == Want.DONE
+    bench.now_ns = START_NS + 900_000
+    assert bench.begin() == Want.DRAIN
+    bench.take(TPDO + 5, tpdo())
+    frames = bench.axes[0].frames
+    assert (frames["late_tpdo"][0], frames["late_tpdo_ns"][0]) == (1, 900_000)
+    assert not bench.axes[0].cycle["overtaken"][0]
+
+
+def test_second_tpdo_of_a_cycle_shows_that_the_first_was_late(bench: Bench) -> None:
+    bench.cycle()
+    bench.begin()
+    bench.take(TPDO + 5, tpdo(3))
+    assert bench.axes[0].cycle["overtaken"][0]
+    assert bench.axes[0].frames["late_tpdo"][0] == 0
+
+
 @given(
     deadline=st.integers(0, 10**15),
     late=st.integers(-(10**9), 10**10),

@@ -12,7 +12,7 @@ from rig import settings_with
 
 from canwall.config import Settings
 from canwall.cycle import Trip, fade_in, make_cycle, run_laws, set_wall, step
-from canwall.cycle.state import start_at
+from canwall.cycle.state import RECENT_CYCLES, start_at
 from canwall.drive import DriveSetup, Field, PdoLayout
 from canwall.record import ROW, Phase
 from canwall.units import DriveUnits
@@ -291,6 +291,54 @@ def test_estimate_after_a_pause_is_the_mean_velocity_of_the_pause() -> None:
     assert wall.trip() == Trip.NONE
     assert wall.row["v_est"][0] == pytest.approx(-4.0, abs=0.7)  # a cycle of friction later
     assert wall.cycle["estimator"]["y"][0, 0] == pytest.approx(0.3, abs=0.01)
+
+
+@pytest.mark.parametrize("bits", [16, 32])
+@settings(deadline=None, max_examples=60)
+@given(data=st.data())
+def test_position_that_overflows_goes_on(bits: int, data: st.DataObject) -> None:
+    layout = PdoLayout(0x185, (Field(POSITION, 0, 0, bits), Field(STATUSWORD, 0, 32, 16)))
+    wall = Wall(tpdo=layout)
+    wall.cycle["phase"] = Phase.LEAVING
+    half = 2 ** (bits - 1)
+    counts = data.draw(st.integers(-half, half - 1))
+    wall.give(counts & (2 * half - 1) | ENABLED << 32)
+    start_at(wall.cycle, int(wall.cycle["counts"][0]))
+    for change in data.draw(st.lists(st.integers(1 - half, half - 1), max_size=8)):
+        counts += change
+        wall.give(counts & (2 * half - 1) | ENABLED << 32)
+        assert wall.row["counts"][0] == counts
+
+
+def test_skipped_syncs_are_motion_and_no_jump() -> None:
+    wall = gliding(20, -400, {"wall.position_rad": -0.9, "limits.speed_rad_s": 30.0})
+    wall.at(-400)
+    wall.cycle["skipped"] = 9
+    wall.at(-400 + 10 * 20)
+    assert wall.trip() == Trip.NONE
+    assert wall.cycle["skipped_sync"][0] == 9
+    assert wall.cycle["innovation"][0] == pytest.approx(0.0, abs=1e-9)
+    wall.at(-400 + 11 * 20)
+    assert wall.cycle["innovation"][0] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_position_after_missing_tpdos_is_a_jump_only_if_the_last_one_is_too_far_as_well() -> None:
+    for far, trip in ((True, Trip.JUMP), (False, Trip.NONE)):
+        wall = gliding(20, 0, {"limits.speed_rad_s": 30.0, "wall.position_rad": -2.0})
+        wall.at(0)
+        for _ in range(10):
+            wall.missing()
+        wall.cycle["estimator"]["y"] += 5.0
+        wall.at(400 if far else 200)
+        assert wall.trip() == trip
+
+
+def test_missing_tpdos_of_late_are_counted() -> None:
+    wall = gliding(0, 100, {})
+    for j in range(200):
+        wall.missing() if j % 5 == 0 else wall.at(100)
+        recent = int(wall.cycle["missed_recently"][0]).bit_count()
+        assert recent == min(j // 5 + 1, RECENT_CYCLES // 5)
 
 
 # Trips

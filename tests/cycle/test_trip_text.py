@@ -1,4 +1,4 @@
-"""Text of a trip after a pause of the master."""
+"""Text of a trip after a pause of the master, or after missing TPDOs."""
 
 import pytest
 from rig import Loop, RigFactory, lack, settings_with
@@ -33,3 +33,33 @@ def test_pause_that_the_watchdog_may_have_met(
     loop.exchange.sync_interval["largest_ns"] = round(pause_s * 1e9)
     end = f"; the master had stood still for {said.format(kind)}" if said else ""
     assert trip_text(loop.axis, loop.exchange).endswith(f" s): EMCY{end}")
+
+
+@pytest.mark.parametrize("trip", [Trip.SPEED, Trip.POSITION, Trip.JUMP, Trip.STUCK, Trip.ENERGY])
+def test_trip_after_missing_tpdos_names_them(make_rig: RigFactory, trip: Trip) -> None:
+    loop = Loop(make_rig(settings_with()))
+    loop.record["trip"] = trip
+    encoder = "look to the encoder and its cable"
+    without = trip_text(loop.axis, loop.exchange)
+    assert ("TPDO" in without, encoder in without) == (False, trip is Trip.JUMP)
+    loop.record["missed_recently"] = 0b1011
+    said = trip_text(loop.axis, loop.exchange)
+    assert said.endswith(
+        "; 3 of the last 50 TPDOs were missing: look to the bus, its load and its termination, "
+        "first"
+    )
+    assert encoder not in said
+
+
+def test_late_tpdos_are_named_where_none_came_in_time(make_rig: RigFactory) -> None:
+    settings = settings_with()
+    bus = settings.bus.model_copy(update={"pace": "real_time"})
+    loop = Loop(make_rig(settings))
+    loop.axis.settings = settings.model_copy(update={"bus": bus})
+    loop.record["trip"], loop.record["missed_in_a_row"] = Trip.MISSED_TPDO, 12
+    assert trip_text(loop.axis, loop.exchange).endswith("no TPDO for 12 cycles")
+    loop.axis.frames["late_tpdo"], loop.axis.frames["late_tpdo_ns"] = 12, 930_000
+    assert trip_text(loop.axis, loop.exchange).endswith(
+        "no TPDO for 12 cycles; 12 came too late, the last one 0.93 ms after its SYNC: bus.cycle_s "
+        "is too short for the drive or the bus"
+    )

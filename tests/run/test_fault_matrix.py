@@ -132,10 +132,12 @@ def found_case(
     code = run_with(folder, case.toml, exchange)
     said = [line.removeprefix("canwall: ") for line in errors().splitlines()]
     record = Record(folder / "run")
-    assert_whole(record, said)
+    assert_whole(record, said if code else [])
     (witness,) = witnesses
     message, commanded, drive = RIDES, "-", "-"
-    if said:
+    if not code:
+        message = "; ".join([RIDES, *said])
+    else:
         message = "; then: ".join(re.sub(r"^cycle \d+ \([\d.]+ s\): ", "", line) for line in said)
         rendering = np.where(record.column("phase") == Phase.RENDERING, 1, 0)
         sent = record.column("torque_cmd_per_mille").astype(int)
