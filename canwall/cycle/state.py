@@ -94,6 +94,7 @@ CYCLE = np.dtype(
         ("laws", "u8", (MAX_LAWS,)),
         ("rendered", RENDERED, (1,)),
         ("faded", RENDERED, (1,)),
+        ("evaluated", "i8"),  # law that is being evaluated, counted from 1; 0: none
         ("fade_cycles", "i8"),
         ("fade_left", "i8"),
         ("estimator", ESTIMATOR, (1,)),

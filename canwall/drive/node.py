@@ -8,9 +8,15 @@ from canopen.emcy import EmcyError
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
+from canwall.bus import DataFrame
+from canwall.bus.can_ids import NMT
 from canwall.drive.link import Link
 from canwall.drive.objects import DEVICE_TYPE
 from canwall.errors import RunFailedError
+
+
+#: NMT commands (CiA 301, 7.2.8.3.1.1).
+_NMT_COMMANDS = {"OPERATIONAL": 1, "PRE-OPERATIONAL": 128, "RESET": 129}
 
 
 class DriveError(RunFailedError):
@@ -26,6 +32,12 @@ class DriveNode:
         self.dictionary = dictionary
         self._node = link.add_node(node_id, dictionary)
         self._changes: list[tuple[int, int, bytes | None]] = []
+
+    def over(self, link: Link) -> "DriveNode":
+        """Return this node on another link, which remembers the same changes."""
+        node = DriveNode(link, self.node_id, self.dictionary)
+        node._changes = self._changes
+        return node
 
     @property
     def emergencies(self) -> list[EmcyError]:
@@ -120,8 +132,11 @@ class DriveNode:
         return failures
 
     def command(self, nmt: str) -> None:
-        """Send an NMT command to this node, given by canopen's name, e.g. PRE-OPERATIONAL."""
-        self._node.nmt.state = nmt
+        """Send an NMT command to this node: OPERATIONAL, PRE-OPERATIONAL or RESET (of the node).
+
+        It depends on nothing that was heard from the node before. Raises can.CanError.
+        """
+        self.link.send(DataFrame(NMT, bytes([_NMT_COMMANDS[nmt], self.node_id])))
 
     def wait_until_present(self, timeout_s: float) -> None:
         """Read the device type until the drive answers. Raises DriveError."""
