@@ -84,7 +84,9 @@ class Call:
             self._seen, self._passed_s, self._begun = progress, 0.0, self._spent()
             self.waited_s = self.computed_s = 0.0
             return
-        computed_s, queued_s = (now - then for now, then in zip(self._spent(), self._begun))
+        computed_s, queued_s = (
+            now - then for now, then in zip(self._spent(), self._begun, strict=True)
+        )
         self.computed_s = computed_s
         self.waited_s = max(0.0, self._passed_s - computed_s - queued_s)
 

@@ -1,6 +1,7 @@
 """Construction and execution of a program of commands: `canwall`, or one of its groups."""
 
 import gc
+import os
 import sys
 from typing import Any, NoReturn
 
@@ -9,6 +10,7 @@ import typer
 from canwall.cli.ending import guarded
 from canwall.cli.output import say
 from canwall.compiled import announce_compiling
+from canwall.supervised import given_up
 
 
 def make_program(**settings: Any) -> typer.Typer:
@@ -30,4 +32,9 @@ def run_program(program: typer.Typer) -> NoReturn:
     # At its end Python looks for garbage among all that was ever imported, for longer than a
     # command may take; all of it goes with the process.
     gc.freeze()
+    if given_up:
+        # A thread still computes with memory that Python would free.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
     sys.exit(code)

@@ -246,7 +246,9 @@ class Exchange:
             overflow = int(core["sync_overflow"])
             if overflow:
                 core["sync_counter"] = core["sync_counter"] % overflow + 1
-            link.send(DataFrame(int(core["sync_id"]), bytes([core["sync_counter"]] * bool(overflow))))
+            link.send(
+                DataFrame(int(core["sync_id"]), bytes([core["sync_counter"]] * bool(overflow)))
+            )
 
     def close(self) -> None:
         """Release the resources of the transport; the link stays open."""

@@ -52,8 +52,8 @@ _FIRST_CYCLES, _FIRST_S = 10, 0.2
 #: Time without a frame, a cycle or a turn of the bus after which a call counts as one that does not
 #: come back: if it waits, and if it computes, as the compiler does for long [s].
 _STANDSTILL_S, _COMPUTING_S = 3.0, 60.0
-#: Processor time after which a law counts as one that does not return: in real time [s, cycles], and
-#: in simulated time, where nothing waits for it [s].
+#: Processor time after which a law counts as one that does not return: in real time [s, cycles],
+#: and in simulated time, where nothing waits for it [s].
 _LAW_S, _LAW_CYCLES, _SIMULATED_LAW_S = 0.02, 5, 0.5
 
 

@@ -14,7 +14,6 @@ from canwall.drive.link import Link
 from canwall.drive.objects import DEVICE_TYPE
 from canwall.errors import RunFailedError
 
-
 #: NMT commands (CiA 301, 7.2.8.3.1.1).
 _NMT_COMMANDS = {"OPERATIONAL": 1, "PRE-OPERATIONAL": 128, "RESET": 129}
 

@@ -7,7 +7,7 @@ import select
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,10 @@ from canwall.record.ring import Ring
 
 #: Time limit for the writer to complete its files after the run, or to draw [s].
 _TIMEOUT_S = 60.0
+
+
+#: Interval at which it is asked whether to wait any longer [s].
+_LOOK_S = 0.05
 
 
 class RecordError(RunFailedError):
@@ -74,10 +78,13 @@ class Recorder:
                 notes.append(f"{self.folder}: {lost} {what} lost: the disk was too slow")
         return notes
 
-    def draw(self) -> list[str]:
-        """Draw run.png once the summary is written. Returns errors, one line each."""
+    def draw(self, given_up: Callable[[], bool] = lambda: False) -> list[str]:
+        """Draw run.png once the summary is written. Returns errors, one line each.
+
+        given_up: Asked meanwhile; True ends the drawing.
+        """
         self._tell(draw=True)
-        error = self._answer()
+        error = self._answer(given_up)
         return [f"{self.folder}: the picture is missing: {error}"] if error else []
 
     def _tell(self, **order: Any) -> None:
@@ -85,13 +92,17 @@ class Recorder:
         with contextlib.suppress(BrokenPipeError):  # `_answer` notices a writer that has died
             self._writer.stdin.write(json.dumps(order).encode() + b"\n")
 
-    def _answer(self) -> str:
+    def _answer(self, given_up: Callable[[], bool] = lambda: False) -> str:
         """Return the writer's error message, empty if all went well."""
         assert self._writer.stdout is not None
         line, deadline = b"", time.monotonic() + _TIMEOUT_S
         while not line.endswith(b"\n"):
-            wait_s = max(0.0, deadline - time.monotonic())
-            readable, _, _ = select.select([self._writer.stdout], [], [], wait_s)
+            readable, _, _ = select.select([self._writer.stdout], [], [], _LOOK_S)
+            if not readable and time.monotonic() < deadline:
+                if given_up():
+                    self._writer.kill()
+                    return "given up; `canwall plot` draws it"
+                continue
             part = os.read(self._writer.stdout.fileno(), 4096) if readable else b""
             if not part:
                 self._writer.kill()

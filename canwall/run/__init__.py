@@ -1,7 +1,7 @@
 """A run from configuration to folder.
 
 `buses` opens the bus, `assembly` builds axes and exchange, `running` executes the run, `result`
-summarises it, `changes` accepts changes of the wall, `stopping` handles the signals that end it.
+summarises it, `changes` accepts changes of the wall.
 `closed_loop` simulates a run in memory, `referent` the continuous wall that it is compared with.
 """
 
@@ -10,14 +10,13 @@ from canwall.run.assembly import (
     make_axis,
     make_exchange,
     make_monitor,
-    prepared_machine,
     render,
     restoring_drives,
 )
 from canwall.run.buses import make_simulated_drive, on_the_bus, open_bus, serve_drive
 from canwall.run.result import RunResult
 from canwall.run.running import run, run_together
-from canwall.run.stopping import StopRequest, stop_on_signals
+from canwall.stopping import StopRequest, stop_on_signals
 
 __all__ = [
     "RunResult",
@@ -29,7 +28,6 @@ __all__ = [
     "make_simulated_drive",
     "on_the_bus",
     "open_bus",
-    "prepared_machine",
     "render",
     "restoring_drives",
     "run",
