@@ -17,6 +17,7 @@ from canwall.cli.options import (
     settings_from,
 )
 from canwall.cli.output import ProgressDisplay, console, errors, say
+from canwall.stopping import stop_on_signals
 
 if TYPE_CHECKING:
     from canwall.bench import Findings
@@ -86,7 +87,6 @@ def latency(
     )
     from canwall.bench import measure_latency
     from canwall.bench.latency_report import report_lines, write_latency
-    from canwall.run import stop_on_signals
 
     processes = os.cpu_count() or 1 if load is None else load
     with ProgressDisplay() as display, stop_on_signals() as stop:

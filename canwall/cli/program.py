@@ -10,6 +10,7 @@ import typer
 from canwall.cli.ending import guarded
 from canwall.cli.output import say
 from canwall.compiled import announce_compiling
+from canwall.supervised import given_up
 
 
 def make_program(**settings: Any) -> typer.Typer:
@@ -32,6 +33,11 @@ def run_program(program: typer.Typer) -> NoReturn:
     # At its end Python looks for garbage among all that was ever imported, for longer than a
     # command may take; all of it goes with the process.
     gc.freeze()
+    if given_up:
+        # A thread still computes with memory that Python would free.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
     sys.exit(code)
 
 

@@ -1,6 +1,7 @@
 """Commands that render walls: `run`, `change` during a run, and the simulated `drive`."""
 
 import gc
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,9 +18,11 @@ from canwall.cli.options import (
 )
 from canwall.cli.output import ProgressDisplay, console, say
 from canwall.errors import ConfigError
+from canwall.stopping import stop_on_signals
 
 if TYPE_CHECKING:
     from canwall.config import Settings
+    from canwall.run import RunResult
 
 
 def run(
@@ -61,11 +64,18 @@ def run(
     many = [_run_settings(path, overrides) for path in files]
     from canwall.record import start_recorders
 
-    with ProgressDisplay() as display, start_recorders(len(many)) as recorders:
-        from canwall.run import run_together  # while the writers of the record start
+    with stop_on_signals(held=False) as stop:
+        with ProgressDisplay() as display, start_recorders(len(many)) as recorders:
+            from canwall.run import run_together  # while the writers of the record start
 
-        gc.freeze()  # modules stay; the collector need not visit them
-        results = run_together(many, recorders, output, display.report, display.advance)
+            gc.freeze()  # modules stay; the collector need not visit them
+            results = run_together(many, recorders, output, display.report, display.advance)
+        code = _tell(results)
+        return INTERRUPTED if code == 0 and stop() else code
+
+
+def _tell(results: "Sequence[RunResult]") -> int:
+    """Print what came of the walls; return the exit code."""
     for result in results:
         console.print(_strike_table(result.summary["strikes"]))
         console.print(f"record: {result.folder.path}", soft_wrap=True, highlight=False)
@@ -78,6 +88,8 @@ def run(
     outcome = results[0].outcome
     for trip in outcome.trips:
         say(trip)
+    if outcome.error is not None:
+        raise outcome.error
     if outcome.trips or any(result.notes or result.not_restored for result in results):
         return FAILED
     return INTERRUPTED if outcome.interrupted else 0
@@ -124,7 +136,7 @@ def drive(
             "bus.interface = 'virtual' ends at this process, so no master could reach the drive; "
             "use 'unixcan' or 'socketcan' (see config/unixcan.toml)"
         )
-    from canwall.run import serve_drive, stop_on_signals
+    from canwall.run import serve_drive
 
     def announce() -> None:
         console.print(

@@ -131,6 +131,7 @@ CORE = np.dtype(
         ("until_ns", "i8"),
         ("sending_ns", "i8"),  # when the SYNC was to be sent
         ("stage", "i8"),
+        ("retired", "?"),  # no more frames, even if a call that was given up comes back
         ("left", "i8"),  # remaining cycles
         ("wall_offset_ns", "i8"),  # CLOCK_REALTIME less CLOCK_MONOTONIC
         # SYNC
@@ -200,6 +201,8 @@ def proceed(cores: NDArray[np.void], now_ns: int) -> int:
     """
     core: Record = cores[0]
     stage = core.stage
+    if core.retired:
+        return _DONE
     if stage == _TPDO_AWAITED:
         return _await_tpdos(core, now_ns)
     if stage == _SYNC_SENT:
@@ -229,6 +232,8 @@ def take(
     stamp (CLOCK_REALTIME) or 0.
     """
     core: Record = cores[0]
+    if core.retired:
+        return _DONE
     wall_ns = stamp_ns if stamp_ns else now_ns + core.wall_offset_ns
     _log(core, wall_ns, RECEIVED, can_id, length, data)
     if core.stage == _TPDO_AWAITED:
@@ -383,6 +388,8 @@ def _answer(core: Record, k: int, data: int, received: bool, received_ns: int) -
     drive.received_ns = received_ns
     rows = elements(drive.row, 1, ROW)
     answer = step(elements(drive.cycle, 1, CYCLE), rows, data, received)
+    if core.retired:
+        return _DONE
     core.answered = k
     core.stage = _RPDO_SENT
     return _send(core, drive.rpdo_id, drive.rpdo_length, answer | drive.constant)

@@ -4,6 +4,7 @@ In real time the SYNCs keep to absolute deadlines; in simulated time they follow
 fast as the drives answer.
 """
 
+import itertools
 import time
 from collections.abc import Iterable, Iterator, Sequence
 
@@ -11,9 +12,10 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
+from canwall.bus import DataFrame
 from canwall.bus.can_ids import EMCY, ERROR_CONTROL, PDOS
 from canwall.bus.raw_socket import CAN_RTR
-from canwall.compiled import data_to_number
+from canwall.compiled import data_to_number, number_to_data
 from canwall.cycle import core as cycle_core
 from canwall.cycle.axis import WallAxis
 from canwall.cycle.core import CORE, DRIVE_FRAMES, INBOX, Handling, Want
@@ -43,6 +45,10 @@ class SyncLostError(can.CanOperationError):
 
     def __init__(self, patience_s: float) -> None:
         super().__init__(f"no SYNC from its producer for {patience_s:g} s")
+
+
+class ExchangeRetiredError(Exception):
+    """A call that was given up has come back, and ends."""
 
 
 class _FrameRing:
@@ -83,7 +89,7 @@ class Exchange:
         Raises:
             can.CanInitializationError: If the transport cannot work on this bus.
         """
-        self._link = link
+        self.link = link
         self.axes = axes
         self._real_time = real_time
         self._period_s = float(axes[0].cycle["period"][0])
@@ -102,8 +108,6 @@ class Exchange:
         self._handling = _handling(axes)
         self._subscribed = -1
         self._core = self._make_core(external_sync)
-        for axis in axes:
-            _warm_up(axis)
         setup = axes[0].setup
         self.transport = transport(
             link,
@@ -180,6 +184,7 @@ class Exchange:
             can.CanError: If the bus fails.
         """
         core = self._core
+        self.check_in_force()
         core["writer_reads"] = self.waits_for_writer
         for axis in self.axes:
             axis.frames["late_limit"] = axis.limits.late_cycles
@@ -193,14 +198,62 @@ class Exchange:
             cycle_core.abandon(core)
             raise
         finally:
-            self._serve_frames()
+            if not core["retired"][0]:
+                self._serve_frames()
+        self.check_in_force()
         for axis in self.axes:
             _check_late(axis)
         self.transport.finish_cycle()
 
+    def warm_up(self) -> None:
+        """Have the laws loaded, which happens at their first call and may take longer than a cycle.
+
+        They are called by address, so loading the core does not load them.
+        """
+        for axis in self.axes:
+            cycle, row = axis.cycle.copy(), axis.row.copy()
+            for phase in Phase:
+                axis.cycle["phase"] = phase
+                step(axis.cycle, axis.row, 0, True)
+                step(axis.cycle, axis.row, 0, False)
+            axis.cycle[:], axis.row[:] = cycle, row
+
+    @property
+    def progress(self) -> tuple[int, ...]:
+        """A value that changes as long as a call of `cycle` gets on, and frames come and go."""
+        at = [(int(a.cycle["j"][0]), int(a.cycle["evaluated"][0])) for a in self.axes]
+        return (self.link.turns, *itertools.chain(*at))
+
+    def retire(self) -> None:
+        """Send no more frames, although a call of `cycle` may still come back."""
+        self._core["retired"] = True
+
+    def check_in_force(self) -> None:
+        """Raise ExchangeRetiredError once this exchange is retired."""
+        if self._core["retired"][0]:
+            raise ExchangeRetiredError
+
+    def send_zero(self, link: Link) -> None:
+        """Send RPDOs that disable the drives, without torque, each with its SYNC.
+
+        They go over another link, without the cycle. Raises can.CanError.
+        """
+        core = self._core[0]
+        for axis in self.axes:
+            rpdo = axis.setup.rpdo
+            link.send(DataFrame(rpdo.cob_id, number_to_data(rpdo.constant, rpdo.length)))
+        if not core["external_sync"]:
+            overflow = int(core["sync_overflow"])
+            if overflow:
+                core["sync_counter"] = core["sync_counter"] % overflow + 1
+            link.send(
+                DataFrame(int(core["sync_id"]), bytes([core["sync_counter"]] * bool(overflow)))
+            )
+
     def close(self) -> None:
         """Release the resources of the transport; the link stays open."""
-        self.transport.close()
+        if not self._core["retired"][0]:  # or else what comes back uses a descriptor of others
+            self.transport.close()
 
     def _serve_python(self, want: Want) -> None:
         if want == Want.HAND_OVER:
@@ -213,17 +266,17 @@ class Exchange:
 
     def _serve_frames(self) -> None:
         """Log the frames that compiled code could not log, and dispatch those in the inbox."""
-        log = self._link.log
+        log = self.link.log
         if log is not None:
             for frame in self._unlogged.take():
                 received = bool(frame["flags"] & RECEIVED)
                 log(float(frame["time_s"]), to_message(frame, ""), received)
         for frame in self._inbox.take():
-            self._link.dispatch(to_message(frame, ""))
+            self.link.dispatch(to_message(frame, ""))
 
     def _choose_log(self) -> None:
         """Log frames where the link logs its own, directly into a ring or by `_serve_frames`."""
-        core, log = self._core, self._link.log
+        core, log = self._core, self.link.log
         owner = getattr(log, "__self__", None)
         ring = owner if isinstance(owner, Ring) else self._unlogged
         core["log_header"] = 0 if log is None else ring.header.ctypes.data
@@ -231,7 +284,7 @@ class Exchange:
 
     def _choose_handling(self) -> None:
         """Only log those PDOs to which nothing in Python has subscribed."""
-        subscribed = self._link.network.subscribers
+        subscribed = self.link.network.subscribers
         if len(subscribed) != self._subscribed:
             self._subscribed = len(subscribed)
             handling = self._handling.copy()
@@ -244,6 +297,7 @@ class Exchange:
         deadline = time.monotonic() + _WRITER_PATIENCE_S
         while self.waits_for_writer and self._record_is_behind():
             time.sleep(0.001)
+            self.link.turns += 1
             self.waits_for_writer = time.monotonic() < deadline
 
     def _record_is_behind(self) -> bool:
@@ -308,16 +362,6 @@ def _error_control_frames(watchdogs: Iterable[Watchdog]) -> NDArray[np.void]:
         record["length"], record["data"] = len(frame.data), data_to_number(frame.data)
         record["period_ns"] = period_ns
     return records
-
-
-def _warm_up(axis: WallAxis) -> None:
-    # Compiled code is loaded at its first call, which may take longer than a cycle. The laws are
-    # called by address, so loading the core does not load them.
-    cycle, row = axis.cycle.copy(), axis.row.copy()
-    for phase in Phase:
-        cycle["phase"] = phase
-        step(cycle, row, 0, True)
-        step(cycle, row, 0, False)
 
 
 def _ns(seconds: float) -> int:

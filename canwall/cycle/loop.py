@@ -1,19 +1,22 @@
 """Loop of a run: enable, render, leave, with a single way out whatever happens in between.
 
-Every exit (end of the run, Ctrl-C, a trip, an exception, failure of the bus) goes through `_leave`:
-zero torque from the very next RPDO, then the CiA 402 state machine down to SWITCH ON DISABLED, and
-only then the drive's watchdog off, which would otherwise report the loss of its master.
-With several axes, the end of one ends all.
+Every exit (end of the run, Ctrl-C, a trip, an exception, failure of the bus, a call that does not
+come back) goes through `_take_down`: zero torque from the very next RPDO, then the CiA 402 state
+machine down to SWITCH ON DISABLED, and only then the drive's watchdog off, which would otherwise
+report the loss of its master. With several axes, the end of one ends all.
 """
 
 import gc
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext, suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import can
 
 from canwall.cycle.axis import WallAxis, WallStage
 from canwall.cycle.exchange import Exchange
+from canwall.cycle.realtime import Grant, real_time_priority
 from canwall.cycle.state import fade_in, fade_over, set_delay, set_limits, set_wall, start_at
 from canwall.cycle.trip_text import latest_emergency, shown_state, trip_text
 from canwall.cycle.trips import Trip
@@ -30,6 +33,7 @@ from canwall.drive import (
 from canwall.drive import objects as od
 from canwall.errors import RunFailedError
 from canwall.record import Phase
+from canwall.supervised import Call
 
 #: Cycles within which a drive has to reach OPERATION ENABLED.
 _ENABLE_CYCLES = 2000
@@ -44,6 +48,12 @@ _DISABLED = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
 #: Cycles before enabling within which position and statusword have to arrive, and the least time
 #: in real time [s], in which master or drive may be delayed.
 _FIRST_CYCLES, _FIRST_S = 10, 0.2
+#: Time without a frame, a cycle or a turn of the bus after which a call counts as one that does not
+#: come back: if it waits, and if it computes, as the compiler does for long [s].
+_STANDSTILL_S, _COMPUTING_S = 3.0, 60.0
+#: Processor time after which a law counts as one that does not return: in real time [s, cycles],
+#: and in simulated time, where nothing waits for it [s].
+_LAW_S, _LAW_CYCLES, _SIMULATED_LAW_S = 0.02, 5, 0.5
 
 
 @dataclass
@@ -58,6 +68,10 @@ class Outcome:
     disabled: bool = False
     notes: list[str] = field(default_factory=list)
     """Steps of the way out that the drives refused, although they are disabled."""
+    machine: dict[str, Grant] = field(default_factory=dict)
+    """What the machine has granted to the loop."""
+    error: BaseException | None = None
+    """Failure of the program itself, which is raised once all else is done."""
 
 
 class WallGivenUpError(RunFailedError):
@@ -69,63 +83,196 @@ def run_loop(
     cycles: int | None,
     stop: Callable[[], bool],
     progress: Callable[[int], None] = lambda j: None,
+    prepared: AbstractContextManager[dict[str, Grant]] | None = None,
+    outcome: Outcome | None = None,
 ) -> Outcome:
     """Enable the drives, render the walls, disable the drives.
+
+    The loop has a thread of its own. The calling thread looks at its progress, and takes the drives
+    down over another link if it does not get on.
 
     Args:
         exchange: Exchange of frames with the drives.
         cycles: Number of SYNCs with the wall rendered, None for a run until it is stopped.
-        stop: Called once a cycle; True ends the run.
-        progress: Called with the cycle about every 100 ms of bus time.
+        stop: Called once a cycle, by the thread of the loop; True ends the run.
+        progress: Called with the cycle about every 100 ms of bus time, by the same thread.
+        prepared: Entered by the thread of the loop: the preparation of the machine.
+        outcome: Filled with the outcome, which is there even if an exception is raised.
+
+    Raises:
+        BaseException: A failure of the program itself, or KeyboardInterrupt if the caller does not
+            hold signals, once the drives have been taken down.
     """
-    outcome = Outcome()
+    outcome = Outcome() if outcome is None else outcome
     loop = Loop(exchange, stop, progress)
+    supervisor = _Supervisor(loop)
     # A collection would stop the cycle for milliseconds; the loop creates no reference cycles.
     gc.collect()
     gc.freeze()
     gc.disable()
     try:
-        loop.enable()
-        outcome.interrupted = loop.render(cycles)
-    except WallGivenUpError as trip:
-        outcome.trips.append(str(trip))
-        outcome.trip_cycle = loop.j - 1
-    except can.CanError as error:
-        outcome.trips.append(f"the bus failed: {error}")
-        outcome.trip_cycle = loop.j
+        supervisor.supervise(cycles, prepared or nullcontext({}), outcome)
     finally:
-        try:
-            _leave(loop, outcome)
-            if outcome.disabled:
-                outcome.notes = loop.disarm()
-        finally:
-            gc.enable()
-            gc.unfreeze()
-            outcome.cycles = loop.j
+        gc.enable()
+        gc.unfreeze()
+        outcome.cycles = loop.j
+    error = outcome.error or supervisor.interruption
+    if error is not None:
+        raise error
     return outcome
 
 
-def _leave(loop: "Loop", outcome: Outcome) -> None:
-    """Disable by RPDO; over SDO if that fails or a trip leaves doubt; as a last resort by NMT."""
+def _run(
+    loop: "Loop",
+    cycles: int | None,
+    prepared: AbstractContextManager[dict[str, Grant]],
+    outcome: Outcome,
+) -> None:
+    """Do what the thread of the loop has to do; the outcome tells of all that fails."""
     try:
-        outcome.disabled = loop.leave()
-        if outcome.disabled and not outcome.trips:
-            return
-        if not outcome.trips:
-            outcome.trips.append("the drive does not follow its RPDOs any more; SDO disabled it")
-    except can.CanError as error:
-        if f"the bus failed: {error}" not in outcome.trips:
-            outcome.trips.append(f"the bus failed while leaving: {error}")
+        with prepared as outcome.machine:
+            try:
+                loop.warm_up()
+                loop.enable()
+                outcome.interrupted = loop.render(cycles)
+            except WallGivenUpError as trip:
+                outcome.trips.append(str(trip))
+                outcome.trip_cycle = loop.j - 1
+            except BaseException as error:
+                _tell(outcome, error)
+                outcome.trip_cycle = loop.j
+            finally:
+                _take_down(loop, outcome, partial(_attempt, loop), loop.leave)
+    except BaseException as error:
+        _tell(outcome, error)
+
+
+def _tell(outcome: Outcome, error: BaseException) -> None:
+    """Add an error to the trips; one of the program itself is kept as well."""
+    text = _named(error)
+    if text not in outcome.trips:
+        outcome.trips.append(text)
+    if not isinstance(error, (can.CanError, RunFailedError)):
+        outcome.error = outcome.error or error
+
+
+def _named(error: BaseException) -> str:
+    if isinstance(error, can.CanError):
+        return f"the bus failed: {error}"
+    if isinstance(error, RunFailedError):
+        return str(error)
+    return f"the program failed: {type(error).__name__}: {error}"
+
+
+#: Calls a rung of the ladder; returns what it raised, None if all went well.
+_Attempt = Callable[[Callable[[], object]], BaseException | None]
+
+
+def _attempt(loop: "Loop", rung: Callable[[], object]) -> BaseException | None:
+    """Try a rung of the ladder in this thread, unless another one has taken over."""
     try:
-        loop.disable_over_sdo()
+        loop.exchange.check_in_force()
+        rung()
+    except BaseException as error:
+        return error
+    return None
+
+
+def _take_down(
+    loop: "Loop", outcome: Outcome, attempt: _Attempt, first: Callable[[], object]
+) -> None:
+    """Disable the drives by RPDO; over SDO if that fails or a trip leaves doubt; at last by NMT.
+
+    Each rung is tried whatever the one before has raised.
+    """
+    failure = attempt(first)
+    if failure is None and loop.is_down and not outcome.trips:
         outcome.disabled = True
-    except DriveError as error:
-        outcome.disabled = False
-        sent = "was sent" if loop.reset() else "could not be sent"
-        outcome.trips.append(
-            f"the drive did not confirm that it is disabled ({error}), NMT RESET NODE {sent}: "
-            f"switch it off before you touch it"
-        )
+    else:
+        if failure is not None and _named(failure) not in outcome.trips:
+            _tell(outcome, failure)
+        elif not outcome.trips:
+            outcome.trips.append("the drive does not follow its RPDOs any more; SDO disabled it")
+        _take_down_without_cycle(loop, outcome, attempt)
+    if outcome.disabled:
+        failure = attempt(lambda: outcome.notes.extend(loop.disarm()))
+        if failure is not None:
+            outcome.notes.append(f"the drive's watchdog may stay set: {_named(failure)}")
+
+
+def _take_down_without_cycle(loop: "Loop", outcome: Outcome, attempt: _Attempt) -> None:
+    failure = attempt(loop.disable_over_sdo)
+    outcome.disabled = failure is None
+    if failure is None:
+        return
+    why = str(failure) if isinstance(failure, DriveError) else _named(failure)
+    sent = "was sent" if attempt(loop.reset) is None else "could not be sent"
+    outcome.trips.append(
+        f"the drive did not confirm that it is disabled ({why}), NMT RESET NODE {sent}: "
+        f"switch it off before you touch it"
+    )
+
+
+class _Supervisor:
+    """Looks at the loop from another thread, and takes the drives down if it does not get on.
+
+    Attributes:
+        interruption: What was raised in this thread meanwhile, KeyboardInterrupt for one.
+    """
+
+    def __init__(self, loop: "Loop") -> None:
+        self._loop = loop
+        self.interruption: BaseException | None = None
+
+    def supervise(
+        self,
+        cycles: int | None,
+        prepared: AbstractContextManager[dict[str, Grant]],
+        outcome: Outcome,
+    ) -> None:
+        """Have the loop run to its end, or to that of this thread's patience."""
+        loop, by_loop = self._loop, Outcome()
+        with real_time_priority(above_loop=True) if loop.real_time else nullcontext():
+            call = Call(lambda: _run(loop, cycles, prepared, by_loop), lambda: loop.progress)
+            why = self._attend(call, loop.hang)
+            # The thread of the loop may still come back, and have something to add.
+            ended = replace(by_loop, trips=[*by_loop.trips], notes=[*by_loop.notes])
+            vars(outcome).update(vars(ended))
+            if why:
+                outcome.trips.append(why)
+                if outcome.trip_cycle is None:
+                    outcome.trip_cycle = loop.j
+                loop.change_link()
+                _take_down(loop, outcome, self._attempt, loop.send_zero)
+
+    def _attend(self, call: Call, hang: Callable[[Call], str]) -> str:
+        """Wait for the end of a call; return "", or why it was given up."""
+        while True:
+            try:
+                if call.has_ended():
+                    return ""
+                if why := hang(call):
+                    call.give_up()
+                    return why
+            except BaseException as interruption:
+                self.interruption = self.interruption or interruption
+                self._loop.interrupt()
+
+    def _attempt(self, rung: Callable[[], object]) -> BaseException | None:
+        """Try a rung of the ladder; the next one has another link if this one hangs."""
+        call = Call(rung, lambda: self._loop.progress)
+        why = self._attend(call, standstill)
+        if why:
+            self._loop.change_link()
+            return RunFailedError(why)
+        return call.error
+
+
+def standstill(call: Call) -> str:
+    """Return why a call counts as one that does not come back, empty if it does not."""
+    if call.waited_s < _STANDSTILL_S and call.computed_s < _COMPUTING_S:
+        return ""
+    return f"no answer from {call.place()} for {call.waited_s + call.computed_s:.2g} s"
 
 
 class Loop:
@@ -137,10 +284,14 @@ class Loop:
         stop: Callable[[], bool] = lambda: False,
         progress: Callable[[int], None] = lambda j: None,
     ) -> None:
-        self._exchange = exchange
+        self.exchange = exchange
         self._axes = exchange.axes
+        self._link = exchange.link
         self._stop = stop
         self._progress = progress
+        self._interrupted = False
+        #: True once the drives have confirmed that they are disabled, to the cycle that leaves.
+        self.is_down = False
         self._period = float(self._axes[0].cycle["period"][0])
         self._progress_every = max(1, round(0.1 / self._period))
         self._delay_tests = []
@@ -154,6 +305,45 @@ class Loop:
     def j(self) -> int:
         """Number of cycles so far."""
         return int(self._axes[0].cycle["j"][0])
+
+    @property
+    def real_time(self) -> bool:
+        """True if the SYNCs follow the clock."""
+        return self._axes[0].settings.real_time
+
+    @property
+    def progress(self) -> tuple[int, ...]:
+        """A value that changes as long as the loop gets on."""
+        return (*self.exchange.progress, self._link.turns)
+
+    def interrupt(self) -> None:
+        """End the wall as `stop` would; another thread may call this."""
+        self._interrupted = True
+
+    def _stops(self) -> bool:
+        return self._interrupted or self._stop()
+
+    def hang(self, call: Call) -> str:
+        """Return why the loop counts as hanging, with the law that does not return; else empty."""
+        limit_s = max(_LAW_S, _LAW_CYCLES * self._period) if self.real_time else _SIMULATED_LAW_S
+        for axis in self._axes:
+            evaluated = int(axis.cycle["evaluated"][0])
+            if evaluated and call.computed_s >= limit_s:
+                name = axis.laws[evaluated - 1].name
+                text = f"law {name} has not returned for {call.computed_s:.2g} s"
+                return self._say(axis, f"cycle {self.j} ({self.j * self._period:.3f} s): {text}")
+        return standstill(call)
+
+    def change_link(self) -> None:
+        """Leave the present link to a call that does not come back, and use another one."""
+        self.exchange.retire()
+        self._link = self._link.beside()
+        for axis in self._axes:
+            axis.node = axis.node.over(self._link)
+
+    def warm_up(self) -> None:
+        """Have the laws loaded."""
+        self.exchange.warm_up()
 
     def _enter(self, phase: Phase) -> None:
         for axis in self._axes:
@@ -171,7 +361,7 @@ class Loop:
         self._first_positions()
         ways = [Enabling() for _ in self._axes]
         for _ in range(_ENABLE_CYCLES):
-            if self._stop():
+            if self._stops():
                 return
             enabled = [_advance_enabling(*pair) for pair in zip(self._axes, ways, strict=True)]
             if all(enabled):
@@ -183,7 +373,7 @@ class Loop:
                 if _is_silent(axis):
                     silent = f"no TPDO for {_SILENT_CYCLES} cycles while enabling"
                     raise WallGivenUpError(self._say(axis, silent))
-            self._exchange.cycle()
+            self.exchange.cycle()
             self._check()
         for axis, way in zip(self._axes, ways, strict=True):
             if not _advance_enabling(axis, way):
@@ -196,7 +386,7 @@ class Loop:
         if self._axes[0].settings.real_time:
             patience = max(patience, round(_FIRST_S / self._period))
         for _ in range(patience):
-            self._exchange.cycle()
+            self.exchange.cycle()
             waiting = [axis for axis in waiting if not axis.row["received"][0]]
             if not waiting:
                 break
@@ -210,7 +400,7 @@ class Loop:
 
         Raises WallGivenUpError at a trip.
         """
-        if self._stop() or self._measure_delays():
+        if self._stops() or self._measure_delays():
             return True
         for axis in self._axes:
             # The handle may be inside the wall, so the force fades in.
@@ -218,11 +408,11 @@ class Loop:
         self._enter(Phase.RENDERING)
         pending = [(axis, list(axis.changes)) for axis in self._axes]
         while cycles is None or self.j < cycles:
-            if self._stop():
+            if self._stops():
                 return True
             for axis, changes in pending:
                 _change(axis, changes, self._period)
-            self._exchange.cycle(self._most(cycles, pending))
+            self.exchange.cycle(self._most(cycles, pending))
             self._check()
             if self.j % self._progress_every == 0:
                 self._progress(self.j)
@@ -230,7 +420,7 @@ class Loop:
 
     def _most(self, cycles: int | None, pending: list[tuple[WallAxis, list[WallStage]]]) -> int:
         """Return the number of cycles to the end, the next progress report or the next change."""
-        ends = [self.j + self._exchange.ahead]
+        ends = [self.j + self.exchange.ahead]
         ends.append((self.j // self._progress_every + 1) * self._progress_every)
         if cycles is not None:
             ends.append(cycles)
@@ -248,11 +438,11 @@ class Loop:
             return False
         self._enter(Phase.MEASURING)
         for _ in range(max(test.cycles for test in tests)):
-            if self._stop():
+            if self._stops():
                 return True
             for test in tests:
                 test.excite()
-            self._exchange.cycle()
+            self.exchange.cycle()
             self._check()
             for test in tests:
                 test.note()
@@ -268,16 +458,20 @@ class Loop:
     def _check(self) -> None:
         for axis in self._axes:
             if axis.cycle["trip"][0]:
-                raise WallGivenUpError(self._say(axis, trip_text(axis, self._exchange)))
+                raise WallGivenUpError(self._say(axis, trip_text(axis, self.exchange)))
 
     def leave(self) -> bool:
         """Take the state machines down with zero torque; return True if the drives confirm it."""
+        self.is_down = self._leave()
+        return self.is_down
+
+    def _leave(self) -> bool:
         self._enter(Phase.LEAVING)
         if any(axis.cycle["trip"][0] == Trip.MISSED_TPDO for axis in self._axes):
             # A silent drive may still receive: command a quick stop, whatever its state.
             for axis in self._axes:
                 axis.cycle["controlword"] = Controlword.QUICK_STOP
-            self._exchange.cycle()
+            self.exchange.cycle()
         unheard = any(axis.cycle["trip"][0] == Trip.TORQUE for axis in self._axes)
         patience = max(_LEAVE_CYCLES, round(_LEAVE_S / self._period))
         for _ in range(_LAST_RPDOS if unheard else patience):
@@ -288,20 +482,29 @@ class Loop:
                 return True
             if all(_is_down(axis) or _is_silent(axis) for axis in self._axes):
                 return False
-            self._exchange.cycle()
+            self.exchange.cycle()
         return False
 
+    def send_zero(self) -> None:
+        """Disable the drives by RPDOs without a cycle. Raises can.CanError."""
+        for _ in range(_LAST_RPDOS):
+            self.exchange.send_zero(self._link)
+
     def disable_over_sdo(self) -> None:
-        """Disable the drives over SDO. Raises DriveError after an attempt with each of them."""
-        failed: DriveError | None = None
-        for axis in self._axes:
-            try:
-                disable(axis.node)
-                axis.node.write(od.TARGET_TORQUE, 0, 0)
-            except DriveError as error:
-                failed = error
-        if failed is not None:
-            raise failed
+        """Disable the drives over SDO.
+
+        Raises:
+            BaseException: What failed last, after an attempt with each of them.
+        """
+        _for_each(self._axes, _disable_over_sdo)
+
+    def reset(self) -> None:
+        """Send NMT RESET NODE, which ends any torque of the drives.
+
+        Raises:
+            BaseException: What failed last, after an attempt with each of them.
+        """
+        _for_each(self._axes, lambda axis: axis.node.command("RESET"))
 
     def disarm(self) -> list[str]:
         """Switch the watchdogs off; return one line for each drive that refuses."""
@@ -309,19 +512,32 @@ class Loop:
         for axis in self._axes:
             try:
                 disarm(axis.node, axis.setup.rpdo, axis.setup.watchdog)
-            except (DriveError, can.CanError) as error:
+            except Exception as error:
                 stays = f"the drive's watchdog ({axis.setup.watchdog.kind}) stays set: {error}"
                 refused.append(self._say(axis, stays))
         return refused
 
-    def reset(self) -> bool:
-        """Send NMT RESET NODE, which ends any torque of the drives; return True if it was sent."""
+
+def _for_each(axes: Sequence[WallAxis], action: Callable[[WallAxis], None]) -> None:
+    """Act on each axis, whatever that raises for the others; raise the last error in the end."""
+    failed: BaseException | None = None
+    for axis in axes:
         try:
-            for axis in self._axes:
-                axis.node.command("RESET")
-        except can.CanError:
-            return False
-        return True
+            action(axis)
+        except BaseException as error:
+            failed = error
+    if failed is not None:
+        raise failed
+
+
+def _disable_over_sdo(axis: WallAxis) -> None:
+    try:
+        disable(axis.node)
+    except BaseException:
+        with suppress(BaseException):
+            axis.node.write(od.TARGET_TORQUE, 0, 0)
+        raise
+    axis.node.write(od.TARGET_TORQUE, 0, 0)
 
 
 def _change(axis: WallAxis, changes: list[WallStage], period: float) -> None:

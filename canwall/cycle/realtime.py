@@ -29,19 +29,22 @@ def limits_line(item: str, value: object) -> str:
 
 
 @contextmanager
-def real_time_priority() -> Iterator[Grant]:
+def real_time_priority(above_loop: bool = False) -> Iterator[Grant]:
     """Run the calling thread under SCHED_FIFO; yield what was granted.
+
+    above_loop: a step above the loop's thread, whose law may not return.
 
     Threads and processes that it starts do not inherit the priority. If RLIMIT_RTPRIO allows only
     a lower priority, that one is used; without permission the scheduling stays unchanged.
     """
     before, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
-    granted = _raise_priority()
+    wanted = _PRIORITY + above_loop
+    granted = _raise_priority(wanted)
     if not granted:
         yield Grant("no real-time priority", limits_line("rtprio", _PRIORITY))
         return
     try:
-        low = granted < _PRIORITY
+        low = granted < wanted
         advice = limits_line("rtprio", _PRIORITY) if low else ""
         yield Grant(f"SCHED_FIFO, priority {granted}", advice)
     finally:
@@ -52,13 +55,13 @@ def real_time_priority() -> Iterator[Grant]:
             os.sched_setscheduler(0, before | os.SCHED_RESET_ON_FORK, parameters)
 
 
-def _raise_priority() -> int:
+def _raise_priority(wanted: int) -> int:
     """Set the highest priority that is allowed and return it, 0 if none is."""
     soft, hard = resource.getrlimit(resource.RLIMIT_RTPRIO)
     if soft != hard:
         resource.setrlimit(resource.RLIMIT_RTPRIO, (hard, hard))
-    for priority in (_PRIORITY, hard):
-        if 0 < priority <= _PRIORITY:
+    for priority in (wanted, hard):
+        if 0 < priority <= wanted:
             policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
             with contextlib.suppress(PermissionError):
                 os.sched_setscheduler(0, policy, os.sched_param(priority))

@@ -97,6 +97,7 @@ CYCLE = np.dtype(
         ("laws", "u8", (MAX_LAWS,)),
         ("rendered", RENDERED, (1,)),
         ("faded", RENDERED, (1,)),
+        ("evaluated", "i8"),  # law that is being evaluated, counted from 1; 0: none
         ("fade_cycles", "i8"),
         ("fade_left", "i8"),
         # The wall as it goes on without TPDOs, at the positions that the estimator predicts.

@@ -122,7 +122,10 @@ def _force_of(cycle: Record, rendered: Record, due: bool) -> float:
     if rendered.law < 0:
         return 0.0
     if due:
+        # A law that does not return is named by what looks at this cycle from beside it.
+        cycle.evaluated = rendered.law + 1
         rendered.force = wall_force(cycle.laws[rendered.law], rendered.wall[0])
+        cycle.evaluated = 0
     return rendered.force
 
 

@@ -18,6 +18,7 @@ import canopen
 from canopen.sdo import SdoClient
 from canopen.sdo.exceptions import SdoCommunicationError
 
+from canwall.bus.can_ids import ERROR_CONTROL, NMT
 from canwall.bus.errors import explained
 from canwall.bus.raw_socket import QUEUE_PATIENCE_NS, QUEUE_RETRY_NS, CFunction
 
@@ -48,6 +49,8 @@ class Link:
             to be called after all.
         log: Called with every frame.
         on_error_frame: Called with every error frame.
+        turns: Number of calls of the bus so far.
+        abandoned: True once a call that may still use the bus was given up; then it stays open.
         network: canopen's network.
     """
 
@@ -56,13 +59,39 @@ class Link:
         bus: can.BusABC,
         idle: Callable[[], None] | None = None,
         compiled_idle: CFunction | None = None,
+        reopen: Callable[[], can.BusABC] | None = None,
     ) -> None:
+        """Make a link.
+
+        Args:
+            bus: The bus.
+            idle: Called instead of blocking while no frame is waiting.
+            compiled_idle: The same for compiled code.
+            reopen: Opens the bus once more, None if that is not possible.
+        """
         self.bus = bus
         self.idle = idle
         self.compiled_idle = compiled_idle
         self.log: FrameLog | None = None
         self.on_error_frame: Callable[[can.Message], None] | None = None
+        self.turns = 0
+        self.abandoned = False
+        self._reopen = reopen
         self.network = _Network(self)
+
+    def beside(self) -> "Link":
+        """Return a link to the same bus beside this one, from which a call does not come back.
+
+        It has a bus of its own if that can be opened once more.
+        """
+        self.abandoned = True
+        bus = self.bus
+        if self._reopen is not None:
+            with contextlib.suppress(Exception):
+                bus = self._reopen()
+        link = Link(bus, self.idle, reopen=self._reopen)
+        link.log = self.log
+        return link
 
     def send(self, message: can.Message) -> None:
         """Send and log a frame. Raises can.CanError."""
@@ -72,6 +101,7 @@ class Link:
 
     def send_unlogged(self, message: can.Message) -> None:
         """Send a frame. Raises can.CanError."""
+        self.turns += 1
         try:
             self.bus.send(message)
         except can.CanOperationError as error:
@@ -100,6 +130,7 @@ class Link:
 
     def receive_unlogged(self, timeout_s: float) -> can.Message | None:
         """Return the next frame; None if there is none in time. Raises can.CanError."""
+        self.turns += 1
         try:
             if self.idle is None:
                 return self.bus.recv(timeout_s)
@@ -112,6 +143,7 @@ class Link:
         deadline = time.monotonic() + timeout_s
         while True:
             message = self.bus.recv(0)
+            self.turns += 1
             if message is not None or time.monotonic() >= deadline:
                 return message
             self.idle()
@@ -210,6 +242,16 @@ class _Node(canopen.RemoteNode):  # type: ignore[misc]
     def __init__(self, node_id: int, dictionary: canopen.ObjectDictionary, link: Link) -> None:
         self._link = link
         super().__init__(node_id, dictionary)
+
+    def associate_network(self, network: canopen.Network) -> None:
+        """Subscribe to SDO answers and EMCY, not to NMT.
+
+        canopen keeps a state of the node by what it hears, and raises KeyError where somebody has
+        sent one that CiA 301 does not have.
+        """
+        super().associate_network(network)
+        network.unsubscribe(ERROR_CONTROL + self.id, self.nmt.on_heartbeat)
+        network.unsubscribe(NMT, self.nmt.on_command)
 
     def add_sdo(self, rx_cobid: int, tx_cobid: int) -> SdoClient:
         client = _Sdo(rx_cobid, tx_cobid, self.object_dictionary, self._link)

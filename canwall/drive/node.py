@@ -9,11 +9,14 @@ from canopen.emcy import EmcyError
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from canwall.bus.can_ids import ERROR_CONTROL
+from canwall.bus import DataFrame
+from canwall.bus.can_ids import ERROR_CONTROL, NMT
 from canwall.drive.link import Link
 from canwall.drive.objects import DEVICE_TYPE
 from canwall.errors import RunFailedError
 
+#: NMT commands (CiA 301, 7.2.8.3.1.1).
+_NMT_COMMANDS = {"OPERATIONAL": 1, "PRE-OPERATIONAL": 128, "RESET": 129}
 #: SDO abort codes of an object, or a sub-index, that a drive does not have.
 _NO_OBJECT = (0x0602_0000, 0x0609_0011)
 #: Time to wait for an answer that is late [s].
@@ -45,6 +48,13 @@ class DriveNode:
         link.network.subscribe(ERROR_CONTROL + node_id, self._error_control)
         self._asked: dict[tuple[int, int], bool] = {}
         self._changes: list[tuple[int, int, bytes | None]] = []
+
+    def over(self, link: Link) -> "DriveNode":
+        """Return this node on another link, which remembers the same changes."""
+        timeout_s = self._node.sdo.RESPONSE_TIMEOUT
+        node = DriveNode(link, self.node_id, self.dictionary, timeout_s)
+        node._changes = self._changes
+        return node
 
     def _error_control(self, can_id: int, data: bytearray, timestamp: float) -> None:
         self.boot_ups += data == b"\0"
@@ -165,8 +175,11 @@ class DriveNode:
         return failures
 
     def command(self, nmt: str) -> None:
-        """Send an NMT command to this node, given by canopen's name, e.g. PRE-OPERATIONAL."""
-        self._node.nmt.state = nmt
+        """Send an NMT command to this node: OPERATIONAL, PRE-OPERATIONAL or RESET (of the node).
+
+        It depends on nothing that was heard from the node before. Raises can.CanError.
+        """
+        self.link.send(DataFrame(NMT, bytes([_NMT_COMMANDS[nmt], self.node_id])))
 
     def wait_until_present(self, timeout_s: float) -> None:
         """Read the device type until the drive answers.

@@ -7,7 +7,7 @@ import select
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,10 @@ from canwall.record.ring import Ring
 
 #: Time limit for the writer to complete its files after the run, or to draw [s].
 _TIMEOUT_S = 60.0
+
+
+#: Interval at which it is asked whether to wait any longer [s].
+_LOOK_S = 0.05
 
 
 class Recorder:
@@ -86,10 +90,13 @@ class Recorder:
                 notes.append(f"{self.folder}: {lost} {what} lost: the disk was too slow")
         return notes
 
-    def draw(self) -> list[str]:
-        """Draw run.png once the summary is written. Returns errors, one line each."""
+    def draw(self, given_up: Callable[[], bool] = lambda: False) -> list[str]:
+        """Draw run.png once the summary is written. Returns errors, one line each.
+
+        given_up: Asked meanwhile; True ends the drawing.
+        """
         self._tell(draw=True)
-        error = self._answer()
+        error = self._answer(given_up)
         return [f"{self.folder}: the picture is missing: {error}"] if error else []
 
     def _tell(self, **order: Any) -> None:
@@ -97,12 +104,16 @@ class Recorder:
         with contextlib.suppress(BrokenPipeError):  # `_listen` notices a writer that has died
             self._writer.stdin.write(json.dumps(order).encode() + b"\n")
 
-    def _answer(self) -> str:
+    def _answer(self, given_up: Callable[[], bool] = lambda: False) -> str:
         """Return the writer's error message on an order, empty if all went well."""
         deadline = time.monotonic() + _TIMEOUT_S
         while not self._answers:
-            wait_s = max(0.0, deadline - time.monotonic())
-            if not self._says.poll(wait_s * 1e3):
+            if not self._says.poll(_LOOK_S * 1e3):
+                if given_up():
+                    self._writer.kill()
+                    return "given up; `canwall plot` draws it"
+                if time.monotonic() < deadline:
+                    continue
                 self._writer.kill()
                 return "the writer of the record does not answer"
             if not self._listen():

@@ -1,8 +1,7 @@
 """A run from configuration to folder.
 
 `buses` opens the bus, `assembly` builds axes and exchange, `running` executes the run, `result`
-summarises it, `recorded` reads one back, `changes` accepts changes of the wall, `stopping` handles
-the signals that end it.
+summarises it, `recorded` reads one back, `changes` accepts changes of the wall.
 `closed_loop` simulates a run in memory, `referent` the continuous wall that it is compared with.
 """
 
@@ -11,7 +10,6 @@ from canwall.run.assembly import (
     make_axis,
     make_exchange,
     make_monitor,
-    prepared_machine,
     render,
     restoring_drives,
 )
@@ -19,7 +17,7 @@ from canwall.run.buses import make_simulated_drive, on_the_bus, open_bus, serve_
 from canwall.run.recorded import RunRecord, read_run
 from canwall.run.result import RunResult
 from canwall.run.running import run, run_together
-from canwall.run.stopping import StopRequest, stop_on_signals
+from canwall.stopping import StopRequest, stop_on_signals
 
 __all__ = [
     "RunRecord",
@@ -32,7 +30,6 @@ __all__ = [
     "make_simulated_drive",
     "on_the_bus",
     "open_bus",
-    "prepared_machine",
     "read_run",
     "render",
     "restoring_drives",

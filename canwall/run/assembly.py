@@ -111,15 +111,27 @@ def render(
     exchange: Exchange,
     stop: Callable[[], bool],
     progress: Callable[[float], None] = lambda now_s: None,
+    outcome: Outcome | None = None,
 ) -> Outcome:
     """Enable the drives, render the walls for `[run] duration_s` or until stopped, disable them.
 
-    progress is called with the bus time [s] about every 100 ms of it.
+    Args:
+        exchange: Exchange of frames with the drives.
+        stop: Asked in the thread of the loop whether to end the walls.
+        progress: Called there with the bus time [s] about every 100 ms of it.
+        outcome: Filled with the outcome, which is there even if an exception is raised.
     """
     settings = exchange.axes[0].settings
     period, end_s = settings.bus.cycle_s, settings.run.duration_s
     cycles = None if end_s is None else round(end_s / period)
-    return run_loop(exchange, cycles, stop, lambda j: progress(j * period))
+    return run_loop(
+        exchange,
+        cycles,
+        stop,
+        lambda j: progress(j * period),
+        _prepared_machine(settings),
+        outcome,
+    )
 
 
 @contextmanager
@@ -139,7 +151,7 @@ def restoring_drives() -> Iterator[tuple[list[WallAxis], dict[str, list[str]]]]:
                 failures[axis.name] = axis.node.restore()
 
 
-def prepared_machine(settings: Settings) -> AbstractContextManager[dict[str, Grant]]:
+def _prepared_machine(settings: Settings) -> AbstractContextManager[dict[str, Grant]]:
     """Prepare the machine for a run in real time; the context yields what was granted."""
     if settings.real_time:
         return real_time_machine(settings.bus.processor)

@@ -12,6 +12,9 @@ from canwall.compiled import compile_beside
 from canwall.config import ConfigError, Settings
 from canwall.drive import Link, refuse_second_master
 
+#: Interfaces that a process may open several times.
+_SEVERAL = ("socketcan", "unixcan", "virtual")
+
 
 def open_bus(settings: Settings) -> can.BusABC:
     """Open the bus of `[bus]`.
@@ -88,27 +91,36 @@ def on_the_bus(*many: Settings) -> Iterator[Link]:
         DictionaryError: If the dictionary of a drive cannot be used.
         DriveError: If another master is on the bus.
     """
-    if not many[0].embedded:
-        with open_bus(many[0]) as bus:
-            link = Link(bus)
-            nodes = [settings.drive.node_id for settings in many]
-            refuse_second_master(link, many[0].bus, nodes)
-            yield link
-        return
-    drives = [make_simulated_drive(settings) for settings in many]
     with ExitStack() as stack:
-        if len(many) == 1 and _is_alone(many[0]):
-            bus, drive_bus = (stack.enter_context(end) for end in socket_pair(many[0].bus.channel))
-            compile_beside("canwall.cycle.sockets", "compile_run")  # the drive is compiled here
-            runner = simdrive.SocketRunner(drives[0], drive_bus)
-            yield Link(bus, runner.poll, runner.compiled)
-            return
-        bus = stack.enter_context(open_bus(many[0]))
-        polls = [
-            simdrive.BusRunner(drive, stack.enter_context(open_bus(settings))).poll
-            for drive, settings in zip(drives, many, strict=True)
-        ]
-        yield Link(bus, idle=polls[0] if len(polls) == 1 else partial(_call_all, polls))
+        link = _open_link(stack, many)
+        try:
+            yield link
+        finally:
+            if link.abandoned:  # what comes back must not find its descriptors in other hands
+                stack.pop_all()
+
+
+def _open_link(stack: ExitStack, many: Sequence[Settings]) -> Link:
+    """Open the bus, and embedded drives, until the stack is closed."""
+    bus = many[0].bus
+    reopen = partial(open_bus, many[0]) if bus.interface in _SEVERAL else None
+    if not many[0].embedded:
+        link = Link(stack.enter_context(open_bus(many[0])), reopen=reopen)
+        refuse_second_master(link, bus, [settings.drive.node_id for settings in many])
+        return link
+    drives = [make_simulated_drive(settings) for settings in many]
+    if len(many) == 1 and _is_alone(many[0]):
+        master, slave = (stack.enter_context(end) for end in socket_pair(bus.channel))
+        compile_beside("canwall.cycle.sockets", "compile_run")  # the drive is compiled here
+        runner = simdrive.SocketRunner(drives[0], slave)
+        return Link(master, runner.poll, runner.compiled)
+    opened = stack.enter_context(open_bus(many[0]))
+    polls = [
+        simdrive.BusRunner(drive, stack.enter_context(open_bus(settings))).poll
+        for drive, settings in zip(drives, many, strict=True)
+    ]
+    idle = polls[0] if len(polls) == 1 else partial(_call_all, polls)
+    return Link(opened, idle, reopen=reopen)
 
 
 def _is_alone(settings: Settings) -> bool:

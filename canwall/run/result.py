@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from canwall.config import ConfigError, Settings
-from canwall.cycle import BusMonitor, Exchange, Grant, Outcome, WallAxis, timing_summary
+from canwall.cycle import BusMonitor, Exchange, Outcome, WallAxis, timing_summary
 from canwall.drive import DriveSetup
 from canwall.errors import RunFailedError
 from canwall.record import RecordError, RunFolder, numbers, read_signals
@@ -41,7 +41,6 @@ def write_result(
     axis: WallAxis,
     exchange: Exchange,
     monitor: BusMonitor,
-    machine: dict[str, Grant],
     folder: RunFolder,
     outcome: Outcome,
     notes: list[str],
@@ -52,7 +51,7 @@ def write_result(
 
     Raises RecordError or RunFailedError if nothing was recorded.
     """
-    settings = axis.settings
+    settings, machine = axis.settings, outcome.machine
     notes = [note for note in notes if note not in outcome.trips]  # each is told once
     signals = _read_recorded(folder, [*outcome.trips, *notes])
     summary = judged(signals, settings, axis.setup.units)

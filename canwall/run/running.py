@@ -8,21 +8,21 @@ from contextlib import closing
 from pathlib import Path
 
 from canwall.config import ConfigError, Settings
-from canwall.cycle import WallGivenUpError, run_laws
+from canwall.cycle import Exchange, Outcome, WallGivenUpError, run_laws
+from canwall.errors import InputError, RunFailedError
 from canwall.record import Recorder, RunFolder, start_recorders
 from canwall.run.assembly import (
     drive_dictionary,
     make_axis,
     make_exchange,
     make_monitor,
-    prepared_machine,
     render,
     restoring_drives,
 )
 from canwall.run.buses import on_the_bus
 from canwall.run.changes import open_to_changes
 from canwall.run.result import RunResult, remarks_on, write_result
-from canwall.run.stopping import stop_on_signals
+from canwall.stopping import stop_on_signals
 
 
 def run(
@@ -49,9 +49,12 @@ def run(
         DictionaryError: If the object dictionary cannot be used; nothing has been enabled.
         DriveError: If the drive cannot be set up.
         RunFailedError: If no cycle was rendered or recorded.
+        Exception: A failure of the program itself, once the record is complete.
     """
-    with start_recorders(1) as recorders:
+    with stop_on_signals(held=False), start_recorders(1) as recorders:
         (result,) = run_together([settings], recorders, output, report, progress, stopped)
+    if result.outcome.error is not None:
+        raise result.outcome.error
     return result
 
 
@@ -67,58 +70,95 @@ def run_together(
 
     Their `[bus]` and `[run]` have to be equal. Each drive's record has a recorder and a folder of
     its own, `node5` …; the bus log is next to these folders.
+
+    Signals are held from the first cycle on; a second one gives up the picture. A failure of the
+    program itself is in the outcome, for the caller to raise.
     """
     _check_together(many)
     laws = [run_laws(settings) for settings in many]
     dictionaries = [drive_dictionary(settings) for settings in many]
-    first = many[0]
-    with on_the_bus(*many) as link:
-        # One log of the bus for all of them.
-        log = first.run.bus_log if len(many) == 1 else f"../{first.run.bus_log}"
-        folders = _run_folders(many, output, log)
-        notes: list[list[str]] = []
-        for folder, known, recorder in zip(folders, laws, recorders, strict=True):
-            bus_log = log if recorder is recorders[0] else ""
-            names = [law.name for law in known]
-            recorder.begin(folder.path, bus_log, first.bus.channel, names)
+    first, outcome = many[0], Outcome()
+    with stop_on_signals(held=False) as stop:
         try:
-            link.log = recorders[0].ring.log_frame
-            report("setting up the drive" if len(many) == 1 else "setting up the drives")
-            with restoring_drives() as (axes, not_restored):
-                for settings, dictionary, known, recorder in zip(
-                    many, dictionaries, laws, recorders, strict=True
-                ):
-                    axes.append(make_axis(link, settings, dictionary, known, recorder.ring))
-                exchange = make_exchange(link, axes)
-                monitor = make_monitor(link, axes)
-                report("rendering")
-                with (
-                    closing(exchange),
-                    open_to_changes(axes, folders),
-                    stop_on_signals() as stop,
-                    prepared_machine(first) as machine,
-                ):
-                    outcome = render(
-                        exchange,
-                        lambda: _recorded(recorders) and (stop() or stopped()),
-                        lambda now_s: progress(now_s, first.run.duration_s),
-                    )
-        finally:
-            notes = [recorder.close() for recorder in recorders]
-    report("summarising")
-    results = []
-    for axis, folder, of_record in zip(axes, folders, notes, strict=True):
-        of_axis = [*of_record, *monitor.notes] if axis is axes[0] else of_record
-        remarks = remarks_on(axis.setup, axis.settings)
-        remarks += outcome.notes if axis is axes[0] else []
-        kept = [f"{axis.name}: not restored: {what}" for what in not_restored.get(axis.name, [])]
-        results.append(
-            write_result(axis, exchange, monitor, machine, folder, outcome, of_axis, remarks, kept)
-        )
-    report("drawing")
-    for recorder, result in zip(recorders, results, strict=True):
-        result.notes.extend(recorder.draw())
+            with on_the_bus(*many) as link:
+                # One log of the bus for all of them.
+                log = first.run.bus_log if len(many) == 1 else f"../{first.run.bus_log}"
+                folders = _run_folders(many, output, log)
+                notes: list[list[str]] = []
+                for folder, known, recorder in zip(folders, laws, recorders, strict=True):
+                    bus_log = log if recorder is recorders[0] else ""
+                    names = [law.name for law in known]
+                    recorder.begin(folder.path, bus_log, first.bus.channel, names)
+                try:
+                    link.log = recorders[0].ring.log_frame
+                    report("setting up the drive" if len(many) == 1 else "setting up the drives")
+                    with restoring_drives() as (axes, not_restored):
+                        for settings, dictionary, known, recorder in zip(
+                            many, dictionaries, laws, recorders, strict=True
+                        ):
+                            axes.append(make_axis(link, settings, dictionary, known, recorder.ring))
+                        exchange = make_exchange(link, axes)
+                        monitor = make_monitor(link, axes)
+                        report("rendering")
+                        with closing(exchange), open_to_changes(axes, folders):
+                            stop.hold()
+                            _render(
+                                exchange,
+                                lambda: _recorded(recorders) and (stop() or stopped()),
+                                progress,
+                                outcome,
+                            )
+                finally:
+                    notes = [recorder.close() for recorder in recorders]
+            report("summarising")
+            results = []
+            for axis, folder, of_record in zip(axes, folders, notes, strict=True):
+                of_axis = [*of_record, *monitor.notes] if axis is axes[0] else of_record
+                remarks = remarks_on(axis.setup, axis.settings)
+                remarks += outcome.notes if axis is axes[0] else []
+                kept = [f"{axis.name}: not restored: {w}" for w in not_restored.get(axis.name, [])]
+                results.append(
+                    write_result(axis, exchange, monitor, folder, outcome, of_axis, remarks, kept)
+                )
+        except Exception as error:
+            if (told := _told(outcome, error)) is error:
+                raise
+            raise told from error
+        report("drawing")
+        enough = 1 if outcome.interrupted else 0
+        for recorder, result in zip(recorders, results, strict=True):
+            picture = recorder.draw(lambda: stop.count > enough)
+            (result.remarks if stop.count > enough else result.notes).extend(picture)
     return results
+
+
+def _render(
+    exchange: Exchange,
+    stop: Callable[[], bool],
+    progress: Callable[[float, float | None], None],
+    outcome: Outcome,
+) -> None:
+    """Render the walls; a failure of the program itself is in the outcome."""
+    end_s = exchange.axes[0].settings.run.duration_s
+    try:
+        render(
+            exchange,
+            stop,
+            lambda now_s: progress(now_s, end_s),
+            outcome,
+        )
+    except Exception as error:
+        outcome.error = outcome.error or error
+
+
+def _told(outcome: Outcome, error: Exception) -> Exception:
+    """Return the error, preceded by the trips if it does not tell them itself."""
+    trips = "; ".join(outcome.trips)
+    if not trips or trips in str(error):
+        return error
+    named = isinstance(error, (InputError, RunFailedError))
+    what = str(error) if named else f"{type(error).__name__}: {error}"
+    return RunFailedError(f"{trips}; then: {what}")
 
 
 def _check_together(many: Sequence[Settings]) -> None:

@@ -105,7 +105,7 @@ def test_stopped_in_between(drives: list[Listening]) -> None:
     stop = StopRequest()
 
     def ask(what: str, now_s: float, end_s: float) -> None:
-        stop.requested = True
+        stop.count = 1
 
     assert measure_latency(settings_of("native"), 60.0, 0, 0, stop, progress=ask) is None
     (listening,) = drives

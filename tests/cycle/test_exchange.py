@@ -237,3 +237,13 @@ def test_rpdo_after_the_next_sync_was_due_is_late(rig: Rig, clock: Clock) -> Non
     for _ in range(6):
         loop.exchange.cycle()
     assert loop.axis.late_rpdo == 1
+
+
+def test_reset_depends_on_nothing_that_was_heard(make_rig: RigFactory) -> None:
+    rig = make_rig()
+    said = [bytes([state]) for state in range(0x100)] + [b"", bytes(8)]
+    for data in said:
+        rig.link.dispatch(can.Message(arbitration_id=0x705, data=data, is_extended_id=False))
+        rig.link.dispatch(can.Message(arbitration_id=0, data=b"\x01\x05", is_extended_id=False))
+        rig.node.command("RESET")
+    assert rig.frames.count((0, b"\x81\x05")) == len(said)

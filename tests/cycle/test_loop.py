@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rig import RPDO1, SDO_REQUEST, SYNC, TPDO1, Loop, Rig, RigFactory, lack, settings_with
 
 from canwall.config import Settings
-from canwall.cycle import Outcome, WallStage
+from canwall.cycle import Outcome, WallStage, run_loop
 from canwall.cycle import exchange as exchange_module
 from canwall.record import Phase
 
@@ -555,6 +555,42 @@ def test_exception_of_the_program_itself_ends_in_order(make_rig: RigFactory) -> 
     assert steps([word for word, _ in loop.rig.rpdos()])[-3:] == DOWN
     assert loop.rig.rpdos()[-1] == (0x00, 0)
     assert loop.rig.node.read(0x6041) & 0x6F == 0x40
+
+
+def test_exchange_that_fails_for_good_is_left_by_sdo(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing()))
+    outcome = Outcome()
+
+    def fail(most: int = 1) -> None:
+        raise ValueError("no cycle any more")
+
+    def fail_from_now_on() -> bool:
+        if loop.record["j"][0] == PRESSING:
+            loop.exchange.cycle = fail  # type: ignore[method-assign]
+        return False
+
+    with pytest.raises(ValueError, match="no cycle any more"):
+        run_loop(loop.exchange, None, fail_from_now_on, outcome=outcome)
+    assert outcome.trips == ["the program failed: ValueError: no cycle any more"]
+    assert outcome.disabled
+    assert loop.rig.node.read(0x6041) & 0x6F == 0x40
+    assert loop.rig.node.read(0x6071) == 0
+
+
+def test_lost_drive_is_reset_after_a_forged_heartbeat(make_rig: RigFactory) -> None:
+    rig = make_rig(pressing())
+    loop = Loop(rig)
+
+    def lose(j: int) -> bool:
+        if j == PRESSING:
+            rig.inject(0x705, b"\x3b")
+            rig.tampering.mute.update((SDO_REQUEST - 0x80, TPDO1))
+        return False
+
+    outcome = loop.run(None, lose)
+    assert "is in NMT state 59" in outcome.trips[0]
+    assert "NMT RESET NODE was sent: switch it off before you touch it" in outcome.trips[-1]
+    assert (0x000, b"\x81\x05") in rig.frames
 
 
 def test_lost_tpdos_are_those_that_the_simulation_loses(make_rig: RigFactory) -> None:

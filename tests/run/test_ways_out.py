@@ -23,6 +23,7 @@ from commands import (
     Start,
     command,
     config_file,
+    python,
     torque_is_on,
     wait_for,
 )
@@ -105,6 +106,8 @@ def walled(
     tmp_path: Path,
     watchdog: str = "RPDO event timer",
     exchange: str = "native",
+    law: str | None = None,
+    waits: bool = True,
 ) -> "Iterator[tuple[subprocess.Popen[str], Witness, Path]]":
     """A master that presses back, its drive, and a witness; with the folder of the run."""
     channel, folder = tmp_path / "bus", tmp_path / "run"
@@ -121,9 +124,11 @@ def walled(
     assert drive.stdout.readline().startswith("simulated drive, node 5")
     witness = Witness(channel)
     try:
-        master = start(COMMAND, "run", file, "--output", folder)
-        wait_for(lambda: witness.torque_is_on() or master.poll() is not None)
-        assert master.poll() is None, master.communicate()[1]
+        other = ("--law", law) if law else ()
+        master = start(COMMAND, "run", file, "--output", folder, *other)
+        if waits:
+            wait_for(lambda: witness.torque_is_on() or master.poll() is not None)
+            assert master.poll() is None, master.communicate()[1]
         yield master, witness, folder
     finally:
         witness.close()
@@ -323,3 +328,144 @@ def test_law_that_fails_in_the_contact(
     assert not torques[trip:].any()
     assert record.column("phase")[trip] == Phase.RENDERING
     assert int(record.column("statusword")[-1]) & 0x6F == 0x40
+
+
+# The law does not return
+
+HANGING = """def hanging(wall):
+    while {condition}:
+        pass
+    return -wall.stiffness * wall.y_sample
+"""
+
+
+def hanging_law(tmp_path: Path, condition: str) -> str:
+    file = tmp_path / "law.py"
+    file.write_text(HANGING.format(condition=condition))
+    return f"{file}:hanging"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("exchange", ["python-can", "native"])
+def test_law_that_does_not_return(tmp_path: Path, exchange: str) -> None:
+    law = hanging_law(tmp_path, "wall.y < 0.0")
+    file = config_file(tmp_path / "c.toml", {'exchange = "auto" ': f'exchange = "{exchange}" '})
+    folder = tmp_path / "run"
+    done = command("run", file, "--law", law, "--duration", 2, "--output", folder)
+    (line,) = done.stderr.splitlines()
+    assert re.search(rf"cycle \d+ \(0\.\d+ s\): law {law} has not returned for [\d.]+ s$", line)
+    assert done.returncode == 1
+    record = Record(folder)
+    assert record.summary["trips"] == [line.removeprefix("canwall: ")]
+    assert record.summary["trip_cycle"] == len(record.column("j"))
+    assert (folder / "trip.csv").exists()
+    last = [bytes(frame.data) for frame in record.frames if frame.arbitration_id == RPDO1][-1]
+    assert rpdo(last) == (0x00, 0)
+    # The embedded drive has heard of it.
+    answers = [bytes(f.data) for f in record.frames if f.arbitration_id == SDO_ANSWER]
+    states = [data[4] for data in answers if data[1:4] == b"\x41\x60\x00"]
+    assert states[-1] & 0x6F == 0x40
+
+
+@pytest.mark.slow
+def test_law_that_does_not_return_from_its_first_call(tmp_path: Path) -> None:
+    law = hanging_law(tmp_path, "wall.y < 1e9")
+    done = command("run", "--law", law, "--duration", 2, "--output", tmp_path / "run")
+    assert (done.returncode, len(done.stderr.splitlines())) == (1, 1)
+    assert f"law {law} has not returned for" in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("exchange", ["python-can", "native"])
+def test_law_that_does_not_return_in_real_time(start: Start, tmp_path: Path, exchange: str) -> None:
+    law = hanging_law(tmp_path, "wall.y < -0.02")
+    with walled(start, tmp_path, exchange=exchange, law=law, waits=False) as (master, witness, _):
+        _, errors = master.communicate(timeout=PATIENCE_S)
+        witness.assert_drive_gives_nothing()
+    assert master.returncode == 1
+    assert f"law {law} has not returned for" in errors
+
+
+IMPATIENT = """
+import signal, sys
+from canwall import cli
+from canwall.cycle import loop
+
+hang = loop.Loop.hang
+
+def signals(self, call):
+    if self.exchange.axes[0].cycle["evaluated"][0]:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGTERM)
+    return hang(self, call)
+
+loop.Loop.hang = signals
+sys.argv = ["canwall", *sys.argv[1:]]
+cli.main()
+"""
+
+
+@pytest.mark.slow
+def test_signals_while_a_law_does_not_return(tmp_path: Path) -> None:
+    law, folder = hanging_law(tmp_path, "wall.y < 0.0"), tmp_path / "run"
+    done = python("-c", IMPATIENT, "run", "--law", law, "--duration", 2, "--output", folder)
+    assert done.returncode == 1
+    assert f"law {law} has not returned for" in done.stderr
+    assert len(Record(folder).summary["trips"]) == 1
+
+
+# Signals while the run is being completed
+
+
+TAIL = """
+import signal, sys
+from canwall import cli
+from canwall.cycle import loop
+from canwall.run import running
+
+noisy = {noisy!r}
+
+def signals(frame, event, argument):
+    if event == "call" and "canwall" in frame.f_code.co_filename:
+        signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(signal.SIGINT)
+
+def before(module, name):
+    function = getattr(module, name)
+    def noisily(*args, **kwargs):
+        if name == noisy:
+            sys.setprofile(signals)
+        return function(*args, **kwargs)
+    setattr(module, name, noisily)
+
+for name in ("_render", "write_result"):
+    before(running, name)
+sys.argv = ["canwall", *sys.argv[1:]]
+cli.main()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noisy", ["_render", "write_result"])
+def test_signals_at_every_call_until_all_is_told(tmp_path: Path, noisy: str) -> None:
+    law = tmp_path / "failing.py"
+    law.write_text(
+        "import math\n\ndef failing(wall):\n    if wall.y_sample < -0.002:\n        "
+        "return math.nan\n    return -wall.stiffness * wall.y_sample\n"
+    )
+    folder = tmp_path / "run"
+    done = python(
+        "-c", TAIL.format(noisy=noisy), "run", "--law", f"{law}:failing", "--duration", 2,
+        "--output", folder,
+    )  # fmt: skip
+    record = Record(folder)
+    assert "Traceback" not in done.stderr
+    assert done.returncode in (1, 130)
+    assert "the picture is missing: given up" in done.stderr
+    assert f"record: {folder}" in done.stdout
+    for trip in record.summary["trips"]:
+        assert trip in done.stderr
+    if noisy == "write_result":
+        assert done.returncode == 1
+        assert len(record.summary["trips"]) == 1
+        assert (folder / "trip.csv").exists()
