@@ -422,7 +422,7 @@ def test_record_that_is_lost(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) ->
 
     monkeypatch.setattr("canwall.record.recorder.Recorder", Lost)
     settings = settings_with({"run.duration_s": 0.3})
-    with pytest.raises(RunFailedError, match="the writer of the record did not finish"):
+    with pytest.raises(RunFailedError, match="the writer of the record has died"):
         canwall.run.run(
             settings, tmp_path / "run", progress=lambda now, end: recorders[0]._writer.kill()
         )
