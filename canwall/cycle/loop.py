@@ -43,6 +43,8 @@ _LEAVE_S, _LEAVE_CYCLES = 0.1, 20
 _SILENT_CYCLES = 50
 #: SYNCs with RPDOs that disable a drive although it no longer seems to follow them.
 _LAST_RPDOS = 5
+#: Attempts to send NMT RESET NODE.
+_RESETS = 2
 #: States in which a drive gives no torque until it is enabled again.
 _DISABLED = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
 #: Cycles before enabling within which position and statusword have to arrive, and the least time
@@ -128,23 +130,23 @@ def _run(
     prepared: AbstractContextManager[dict[str, Grant]],
     outcome: Outcome,
 ) -> None:
-    """Do what the thread of the loop has to do; the outcome tells of all that fails."""
-    try:
-        with prepared as outcome.machine:
-            try:
-                loop.warm_up()
-                loop.enable()
-                outcome.interrupted = loop.render(cycles)
-            except WallGivenUpError as trip:
-                outcome.trips.append(str(trip))
-                outcome.trip_cycle = loop.j - 1
-            except BaseException as error:
-                _tell(outcome, error)
-                outcome.trip_cycle = loop.j
-            finally:
-                _take_down(loop, outcome, partial(_attempt, loop), loop.leave)
-    except BaseException as error:
-        _tell(outcome, error)
+    """Do what the thread of the loop has to do.
+
+    The outcome tells of all that fails but the ladder itself. Raises what that raises.
+    """
+    with prepared as outcome.machine:
+        try:
+            loop.warm_up()
+            loop.enable()
+            outcome.interrupted = loop.render(cycles)
+        except WallGivenUpError as trip:
+            outcome.trips.append(str(trip))
+            outcome.trip_cycle = loop.j - 1
+        except BaseException as error:
+            _tell(outcome, error)
+            outcome.trip_cycle = loop.j
+        finally:
+            _take_down(loop, outcome, partial(_attempt, loop), loop.leave)
 
 
 def _tell(outcome: Outcome, error: BaseException) -> None:
@@ -206,7 +208,8 @@ def _take_down_without_cycle(loop: "Loop", outcome: Outcome, attempt: _Attempt) 
     if failure is None:
         return
     why = str(failure) if isinstance(failure, DriveError) else _named(failure)
-    sent = "was sent" if attempt(loop.reset) is None else "could not be sent"
+    was_sent = any(attempt(loop.reset) is None for _ in range(_RESETS))
+    sent = "was sent" if was_sent else "could not be sent"
     outcome.trips.append(
         f"the drive did not confirm that it is disabled ({why}), NMT RESET NODE {sent}: "
         f"switch it off before you touch it"
@@ -240,10 +243,14 @@ class _Supervisor:
             vars(outcome).update(vars(ended))
             if why:
                 outcome.trips.append(why)
-                if outcome.trip_cycle is None:
-                    outcome.trip_cycle = loop.j
                 loop.change_link()
-                _take_down(loop, outcome, self._attempt, loop.send_zero)
+            elif call.error is not None:
+                _tell(outcome, call.error)
+            else:
+                return
+            if outcome.trip_cycle is None:
+                outcome.trip_cycle = loop.j
+            _take_down(loop, outcome, self._attempt, loop.send_zero)
 
     def _attend(self, call: Call, hang: Callable[[Call], str]) -> str:
         """Wait for the end of a call; return "", or why it was given up."""
