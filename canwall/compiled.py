@@ -25,8 +25,8 @@ Record: TypeAlias = Any
 class _Compiling:
     """Compilation in this process, and the announcement of a long one."""
 
-    #: Time of compiling that is not announced [s].
-    SILENT_S = 1.0
+    #: Processor time of compiling that is not announced [s].
+    SILENT_S = 3.0
 
     def __init__(self) -> None:
         self.tell: Callable[[], None] | None = None
@@ -35,7 +35,7 @@ class _Compiling:
 
     def note_miss(self) -> None:
         """Note that a function is being compiled; a long first start compiles many in a row."""
-        now_s = time.monotonic()
+        now_s = time.process_time()
         self._spent_s += min(now_s - self._last_s, 0.3)
         self._last_s = now_s
         if self.tell is not None and self._spent_s > self.SILENT_S:

@@ -253,6 +253,13 @@ class _Node(canopen.RemoteNode):  # type: ignore[misc]
         network.unsubscribe(ERROR_CONTROL + self.id, self.nmt.on_heartbeat)
         network.unsubscribe(NMT, self.nmt.on_command)
 
+    def remove_network(self) -> None:
+        """Unsubscribe from everything; canopen expects its own subscriptions to be there."""
+        if self.has_network():
+            self.network.subscribe(ERROR_CONTROL + self.id, self.nmt.on_heartbeat)
+            self.network.subscribe(NMT, self.nmt.on_command)
+        super().remove_network()
+
     def add_sdo(self, rx_cobid: int, tx_cobid: int) -> SdoClient:
         client = _Sdo(rx_cobid, tx_cobid, self.object_dictionary, self._link)
         self.sdo_channels.append(client)

@@ -89,6 +89,9 @@ def _summary_from_rows(folder: RunFolder, signals: "pa.Table") -> dict[str, Any]
     return judged(signals, settings, units) | {
         "cut_off": True,
         "missed_tpdo": sum(chunk.false_count for chunk in signals["received"].chunks),
+        "late_tpdo": None,
+        "tpdo_lag_cycles": None,
+        "skipped_sync": None,
         "late_rpdo": None,
         "error_frames": _error_frames(folder.path / settings.run.bus_log),
         "trips": [

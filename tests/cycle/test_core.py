@@ -148,6 +148,11 @@ def test_tpdo_that_does_not_come_is_answered_for_in_time() -> None:
     assert until_ns == START_NS + 1_000_000_000
     bench.now_ns = until_ns - 1
     assert bench.proceed() == Want.FRAME
+    # The machine may have been away, so there is a second look.
+    bench.now_ns = until_ns
+    assert bench.proceed() == Want.FRAME
+    until_ns = int(bench.core["until_ns"][0])
+    assert until_ns == bench.now_ns + 50_000_000
     bench.now_ns = until_ns
     assert bench.proceed() == Want.DONE
     assert bench.sent == [SYNC, RPDO + 6, RPDO + 5]
