@@ -141,7 +141,7 @@ def _run(
             outcome.interrupted = loop.render(cycles)
         except WallGivenUpError as trip:
             outcome.trips.append(str(trip))
-            outcome.trip_cycle = loop.j - 1
+            outcome.trip_cycle = loop.trip_cycle
         except BaseException as error:
             _tell(outcome, error)
             outcome.trip_cycle = loop.j
@@ -312,6 +312,11 @@ class Loop:
     def j(self) -> int:
         """Number of cycles so far."""
         return int(self._axes[0].cycle["j"][0])
+
+    @property
+    def trip_cycle(self) -> int:
+        """The first cycle without the wall after a trip: the next one if it came after the RPDO."""
+        return self.j - (not any(axis.row["torque_cmd_per_mille"][0] for axis in self._axes))
 
     @property
     def real_time(self) -> bool:

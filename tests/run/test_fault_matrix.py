@@ -99,7 +99,7 @@ def witnesses(monkeypatch: pytest.MonkeyPatch) -> list[Witness]:
         return drive
 
     monkeypatch.setattr(canwall.run.buses, "make_simulated_drive", watched)
-    monkeypatch.setattr(Recorder, "draw", lambda recorder: [])
+    monkeypatch.setattr(Recorder, "draw", lambda recorder, given_up: [])
     monkeypatch.setattr(exchange_module, "_SIMULATED_TIMEOUT_S", 0.02)
     monkeypatch.setattr(exchange_module, "_MISSING_TIMEOUT_S", 0.002)
     return found
