@@ -9,6 +9,7 @@ import typer
 
 from canwall.cli.ending import guarded
 from canwall.cli.output import say
+from canwall.code_on_disk import is_first_start
 from canwall.compiled import announce_compiling
 from canwall.supervised import given_up
 
@@ -26,9 +27,12 @@ def make_program(**settings: Any) -> typer.Typer:
 def run_program(program: typer.Typer) -> NoReturn:
     """Run the program with the arguments of the process and exit with its exit code."""
     _occupy_standard_streams()
-    announce_compiling(
-        lambda: say("compiling for this machine, about half a minute; later starts have it on disk")
-    )
+    if is_first_start():
+        announce_compiling(
+            lambda: say(
+                "compiling for this machine, about half a minute; later starts have it on disk"
+            )
+        )
     code = guarded(lambda: program(standalone_mode=False))
     # At its end Python looks for garbage among all that was ever imported, for longer than a
     # command may take; all of it goes with the process.

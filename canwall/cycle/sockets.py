@@ -78,6 +78,8 @@ class SocketTransport:
         """
         self._link = link
         self._core = core
+        while link.serve(0.0):  # what has come so far might not pass the filters of a new socket
+            pass
         self._cycle_socket = CycleSocket(
             link.bus, frames.received, frames.sent, stamps=frames.real_time
         )

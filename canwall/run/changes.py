@@ -47,9 +47,9 @@ def open_to_changes(axes: Sequence[WallAxis], folders: Sequence[RunFolder]) -> I
             judge = threading.Thread(target=_judge, args=(axis, mailbox, ended), daemon=True)
             judge.start()
             stack.callback(judge.join)
+            stack.callback(ended.set)
             folder.write_live(mailbox.address)
             stack.callback(folder.live.unlink, missing_ok=True)
-        stack.callback(ended.set)
         yield
 
 

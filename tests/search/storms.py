@@ -134,7 +134,7 @@ def _watched() -> Iterator[list[Witness]]:
 
     with (
         patch.object(canwall.run.buses, "make_simulated_drive", watched),
-        patch.object(Recorder, "draw", lambda recorder: []),
+        patch.object(Recorder, "draw", lambda recorder, given_up: []),
         patch.object(exchange_module, "_SIMULATED_TIMEOUT_S", 0.02),
         patch.object(exchange_module, "_MISSING_TIMEOUT_S", 0.002),
     ):

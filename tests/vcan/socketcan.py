@@ -153,7 +153,7 @@ def light() -> Iterator[None]:
     Neither has to do with the bus, and each takes an emulated processor ten seconds.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(canwall.record.Recorder, "draw", lambda recorder: [])
+        patch.setattr(canwall.record.Recorder, "draw", lambda recorder, given_up: [])
         patch.setattr(canwall.record.recorder.subprocess, "Popen", _ForkedWriter)
         yield
 
