@@ -85,10 +85,12 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture(autouse=True)
 def _little_to_collect() -> None:
-    """Keep what there is by now from the garbage collector.
+    """Keep what there is by now from the garbage collector, once it has taken the last test's rest.
 
-    Each wall has it run before its first cycle, which would take longer than many a wall.
+    Each wall has it run before its first cycle, which would take longer than many a wall. What is
+    kept while it waits to be collected would hold its descriptors to the end.
     """
+    gc.collect()
     gc.freeze()
 
 

@@ -137,6 +137,7 @@ class Rig:
         self.frames: list[tuple[int, bytes]] = []
         dictionary = load_eds(self.settings.drive.eds, 5, REQUIRED_OBJECTS)
         self.node = DriveNode(self.link, 5, dictionary, self.settings.drive.sdo_timeout_s)
+        self.rings: list[Ring] = []
 
     def switch_on(self, drive: simdrive.SimulatedDrive) -> simdrive.BusRunner:
         """Put the drive onto its end of the bus."""
@@ -148,6 +149,8 @@ class Rig:
     def close(self) -> None:
         self.bus.shutdown()
         self.drive_bus.shutdown()
+        for ring in self.rings:
+            ring.close()
 
     def set_up(self) -> DriveSetup:
         settings = self.settings
@@ -187,6 +190,7 @@ class Loop:
         self.laws = run_laws(rig.settings)
         self.setup = rig.set_up()
         self.ring = Ring.create()
+        rig.rings.append(self.ring)
         self.axis = WallAxis(rig.node, self.setup, rig.settings, self.laws, self.ring)
         self.record = self.axis.cycle
         self.exchange = self.make_exchange(real_time)

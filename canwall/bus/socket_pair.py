@@ -4,12 +4,12 @@ What is sent at one end is received at the other. There is no hub: compiled code
 exchanges its frames with the other without anybody in between.
 """
 
-import select
 import socket
 import time
 
 import can
 
+from canwall.bus.readable import is_readable
 from canwall.bus.unixcan import decode_frame, encode_frame, prepared, receive_frame
 
 _RETRY_S = 0.001
@@ -29,7 +29,7 @@ class SocketPairBus(can.BusABC):
         return self._socket.fileno()
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        if timeout != 0.0 and not select.select((self._socket,), (), (), timeout)[0]:
+        if timeout != 0.0 and not is_readable(self._socket, timeout):
             return None, False
         frame = receive_frame(self._socket)
         if frame == b"":

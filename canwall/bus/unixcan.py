@@ -29,6 +29,8 @@ from typing import BinaryIO
 import can
 from can.typechecking import AutoDetectedConfig, CanFilters, Channel
 
+from canwall.bus.readable import is_readable
+
 log = logging.getLogger(__name__)
 
 _FRAME = struct.Struct("=IB3x8s")
@@ -405,8 +407,7 @@ class UnixBus(can.BusABC):
         inbox = self._inbox
         inbox.waiting = True
         try:
-            # Not epoll's own wait, which rounds up to whole milliseconds.
-            ready, _, _ = select.select((self._epoll,), (), (), timeout)
+            ready = is_readable(self._epoll, timeout)
         finally:
             inbox.attended, inbox.waiting = True, False
         if not ready:

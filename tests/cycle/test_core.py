@@ -1,5 +1,6 @@
 """The core of the cycle alone: frames and times of the test's own, without a bus or a clock."""
 
+import weakref
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
@@ -44,7 +45,9 @@ class Bench:
         watchdog: Watchdog = NO_WATCHDOG,
         overflow: int = 0,
     ) -> None:
-        self.axes = [_axis(5 + k, watchdog, overflow) for k in range(drives)]
+        ring = Ring.create()
+        weakref.finalize(self, ring.close)
+        self.axes = [_axis(5 + k, watchdog, overflow, ring) for k in range(drives)]
         self.link = Link(cast(can.BusABC, SimpleNamespace()))
         self.exchange = Exchange(self.link, self.axes, real_time, external_sync, no_transport)
         self.exchange._choose_handling()
@@ -89,7 +92,7 @@ def tpdo(counts: int = 0, statusword: int = ENABLED) -> bytes:
     return counts.to_bytes(4, "little", signed=True) + statusword.to_bytes(2, "little") + b"\0\0"
 
 
-def _axis(node_id: int, watchdog: Watchdog, overflow: int) -> WallAxis:
+def _axis(node_id: int, watchdog: Watchdog, overflow: int, ring: Ring) -> WallAxis:
     settings = settings_with({"wall.law": "standard"})
     layout = PdoLayout(
         TPDO + node_id,
@@ -99,7 +102,7 @@ def _axis(node_id: int, watchdog: Watchdog, overflow: int) -> WallAxis:
     setup = DriveSetup(DriveUnits(131072.0, 0.637), SYNC, layout, rpdo, watchdog)
     setup = replace(setup, sync_counter_overflow=overflow)
     node = cast(DriveNode, SimpleNamespace(node_id=node_id, emergencies=[]))
-    axis = WallAxis(node, setup, settings, run_laws(settings), Ring.create())
+    axis = WallAxis(node, setup, settings, run_laws(settings), ring)
     axis.cycle["phase"], axis.cycle["controlword"] = Phase.RENDERING, 0x0F
     start_at(axis.cycle, 0)
     return axis

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -201,7 +202,7 @@ def test_rows_of_another_kind_are_no_record(four_strikes: Record, tmp_path: Path
 @pytest.mark.slow
 @pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&-", "<&- >&- 2>&-"])
 def test_streams_that_are_closed_at_start(tmp_path: Path, closed: str) -> None:
-    line = f"exec {COMMAND} run --duration 0.5 --output run {closed}"
+    line = f"exec {shlex.quote(COMMAND)} run --duration 0.5 --output run {closed}"
     done = subprocess.run(
         ["sh", "-c", line], cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S
     )
@@ -214,7 +215,7 @@ def test_streams_that_are_closed_at_start(tmp_path: Path, closed: str) -> None:
 
 @pytest.mark.slow
 def test_output_that_cannot_be_written(tmp_path: Path) -> None:
-    line = f"exec {COMMAND} run --duration 0.1 --output $0"
+    line = f'exec {shlex.quote(COMMAND)} run --duration 0.1 --output "$0"'
     for n, (streams, said) in enumerate(
         [
             (">/dev/full", ["canwall: standard output cannot be written: No space left on device"]),
@@ -301,8 +302,9 @@ def test_no_file_can_be_larger(tmp_path: Path, size: int) -> None:
 
 @pytest.mark.slow
 def test_no_shared_memory(tmp_path: Path) -> None:
-    shell = f"ulimit -f 100; exec {COMMAND} run --duration 0.1 --output {tmp_path}/run"
-    done = subprocess.run(["sh", "-c", shell], capture_output=True, text=True, timeout=PATIENCE_S)
+    shell = f'ulimit -f 100; exec {shlex.quote(COMMAND)} run --duration 0.1 --output "$0"'
+    words = ["sh", "-c", shell, str(tmp_path / "run")]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE_S)
     assert done.returncode == 1
     assert one_line(done.stderr).startswith("canwall: the writer of the record does not start: ")
 
@@ -311,10 +313,10 @@ def test_no_shared_memory(tmp_path: Path) -> None:
 DISKS = [4, 16, 40, 100, 200, 300]
 
 ON_A_DISK = """
-mount -t tmpfs -o size={size}k none {disk} || exit 77
-{command} run --duration 1 --output {disk}/run
+mount -t tmpfs -o size="$1k" none "$2" || exit 77
+"$0" run --duration 1 --output "$2/run"
 code=$?
-cp -r {disk}/run {copy}
+cp -r "$2/run" "$3"
 exit $code
 """
 
@@ -324,8 +326,8 @@ exit $code
 def test_full_disk(tmp_path: Path, size: int) -> None:
     disk, copy = tmp_path / "disk", tmp_path / "copy"
     disk.mkdir()
-    script = ON_A_DISK.format(size=size, disk=disk, copy=copy, command=COMMAND)
-    words = ["unshare", "--mount", "--map-root-user", "sh", "-c", script]
+    arguments = [COMMAND, str(size), str(disk), str(copy)]
+    words = ["unshare", "--mount", "--map-root-user", "sh", "-c", ON_A_DISK, *arguments]
     done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE_S)
     if done.returncode == 77 or "unshare failed" in done.stderr:
         pytest.skip("no mounts of its own on this machine")

@@ -55,6 +55,7 @@ def rendered(exchange: str, overrides: dict[str, Any], asks_at: int = 0) -> Any:
         outcome = render(cycle, stop)
         assert outcome.trips == []
     rows = ring.take_rows()
+    ring.close()
     pdos = [frame for frame in frames if frame[0] in PDOS]
     return rows, pdos, len(polls), read
 

@@ -21,16 +21,19 @@ from socketcan import (
 )
 
 _OF_THE_MASTER = (0x000, SYNC, RPDO1, SDO_REQUEST)
-#: canplayer waits for no answer: it is given so many times the time that the master took.
-_SLOWER = 4.0
+#: canplayer waits for no answer: it is given so many times the time that the master took, but no
+#: longer between two frames [s] than a drive needs for one. The master loads code before a SYNC.
+_SLOWER, _LONGEST_S = 4.0, 0.5
 
 
 def _write_log(path: Path, frames: list[can.Message]) -> None:
-    begin = frames[0].timestamp
+    at_s = last_s = frames[0].timestamp
     with can.CanutilsLogWriter(path, channel="vcan0") as log:
         for frame in frames:
+            at_s += min(_SLOWER * (frame.timestamp - last_s), _LONGEST_S)
+            last_s = frame.timestamp
             slowed = copy(frame)
-            slowed.timestamp = begin + _SLOWER * (frame.timestamp - begin)
+            slowed.timestamp = at_s
             log.on_message_received(slowed)
 
 
