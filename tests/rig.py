@@ -210,7 +210,12 @@ class Loop:
     ) -> Outcome:
         """`stop` is asked once a cycle, with the cycle: a place to do things as well."""
         self.axis.changes = changes or []
-        return run_loop(self.exchange, cycles, lambda: stop(int(self.record["j"][0])), progress)
+        return run_loop(
+            self.exchange,
+            lambda loop: loop.render(cycles),
+            lambda: stop(int(self.record["j"][0])),
+            progress,
+        )
 
     def rows(self) -> NDArray[np.void]:
         """One row per cycle so far."""

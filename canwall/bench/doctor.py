@@ -4,7 +4,6 @@ The drive is set up as for a run, enabled with zero torque for the test, disable
 that was changed is put back.
 """
 
-import contextlib
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -13,7 +12,7 @@ from dataclasses import dataclass, field
 from canwall.bench.budget import USABLE, cycle_budget
 from canwall.bench.latency import measurement_settings
 from canwall.config import Settings
-from canwall.cycle import Exchange, Loop, WallAxis, WallGivenUpError, run_laws
+from canwall.cycle import Exchange, Loop, WallAxis, run_laws, run_loop
 from canwall.drive import DriveError, DriveNode, DriveSetup, Link, PdoLayout, disable, set_up
 from canwall.drive import objects as od
 from canwall.drive.cia402 import DriveState, state_of, status_text
@@ -152,40 +151,41 @@ def _test(
     """Enable with zero torque, fall silent, and watch the drive let go."""
     axis = WallAxis(node, setup, settings, run_laws(settings), Ring.create())
     announce("enabling the drive with zero torque: keep clear of the handle")
+
+    def work(loop: Loop) -> bool:
+        findings.add("enabling", "0x6041", "OPERATION ENABLED with zero torque")
+        if setup.watchdog.kind != "none":
+            _fall_silent(axis, loop, announce, findings)
+        return loop.stops()
+
     try:
         with closing(make_exchange(node.link, [axis])) as exchange:
-            loop = Loop(exchange)
-            loop.enable()
-            findings.add("enabling", "0x6041", "OPERATION ENABLED with zero torque")
-            if setup.watchdog.kind != "none":
-                _fall_silent(axis, exchange, announce, findings)
-            loop.leave()
+            outcome = run_loop(exchange, work)
+        if outcome.trips:
+            raise DriveError(f"node {node.node_id}: {'; '.join(outcome.trips)}")
+        # The drive has left by its watchdog or by its RPDOs; what is in its objects is put to rest.
         disable(node)
-    except WallGivenUpError as error:
-        raise DriveError(f"node {node.node_id}: {error}") from None
-    except BaseException:
-        # The cycle may be what does not work, or somebody lost patience; SDO gets through.
-        with contextlib.suppress(DriveError):
-            node.write(od.TARGET_TORQUE, 0, 0)
-            node.write(od.CONTROLWORD, 0, 0)
-        raise
+        for note in outcome.notes:
+            findings.add("put back", "not done", note, well=False)
     finally:
         axis.ring.close()
 
 
 def _fall_silent(
-    axis: WallAxis, exchange: Exchange, announce: Callable[[str], None], findings: Findings
+    axis: WallAxis, loop: Loop, announce: Callable[[str], None], findings: Findings
 ) -> None:
-    node, watchdog = axis.node, axis.setup.watchdog
+    node, watchdog, exchange = axis.node, axis.setup.watchdog, loop.exchange
     alive_until = time.monotonic() + max(_ALIVE_S, 2.0 * watchdog.time_s)
-    while time.monotonic() < alive_until:
+    while time.monotonic() < alive_until and not loop.stops():
         exchange.cycle()
         statusword = int(axis.cycle["statusword"][0])
         if state_of(statusword) is not DriveState.OPERATION_ENABLED:
             raise RunFailedError(
-                f"node {node.node_id} went to {status_text(statusword)} while its master was "
-                f"alive: drive.watchdog_s = {watchdog.time_s:g} may be too short for this machine"
+                f"went to {status_text(statusword)} while its master was alive: drive.watchdog_s "
+                f"= {watchdog.time_s:g} may be too short for this machine"
             )
+    if loop.stops():
+        return
     last_sign_s = _last_sign_of_life_s(axis, exchange)
     announce(f"falling silent, as a dead master would: {watchdog.kind}")
     while True:

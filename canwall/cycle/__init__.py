@@ -4,7 +4,7 @@ from canwall.cycle.axis import Offer, WallAxis, WallStage
 from canwall.cycle.bus_monitor import BusMonitor
 from canwall.cycle.exchange import Exchange, SyncLostError
 from canwall.cycle.laws import named_law, run_laws, with_law
-from canwall.cycle.loop import Loop, Outcome, WallGivenUpError, run_loop
+from canwall.cycle.loop import Loop, WallGivenUpError
 from canwall.cycle.machine import real_time_machine
 from canwall.cycle.python_can import PythonCanTransport
 from canwall.cycle.realtime import Grant, real_time_priority
@@ -14,6 +14,7 @@ from canwall.cycle.step import step
 from canwall.cycle.timing import HISTOGRAM, buckets_ns, observe_ns, percentile_ns, timing_summary
 from canwall.cycle.transport import CycleFrames, Transport
 from canwall.cycle.trips import Trip
+from canwall.cycle.way_out import Outcome, run_loop
 
 __all__ = [
     "CYCLE",

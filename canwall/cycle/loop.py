@@ -1,28 +1,18 @@
-"""Loop of a run: enable, render, leave, with a single way out whatever happens in between.
+"""Loop of a run: enable, render, leave.
 
-Every exit (end of the run, Ctrl-C, a trip, an exception, failure of the bus, a call that does not
-come back) goes through `_take_down`: zero torque from the very next RPDO, then the CiA 402 state
-machine down to SWITCH ON DISABLED, and only then the drive's watchdog off, which would otherwise
-report the loss of its master. With several axes, the end of one ends all.
+Every exit goes through the ladder of `way_out`. With several axes, the end of one ends all.
 """
 
-import gc
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext, suppress
-from dataclasses import dataclass, field, replace
-from functools import partial
-
-import can
+from contextlib import suppress
 
 from canwall.cycle.axis import WallAxis, WallStage
 from canwall.cycle.exchange import Exchange
-from canwall.cycle.realtime import Grant, real_time_priority
 from canwall.cycle.state import fade_in, fade_over, set_delay, set_limits, set_wall, start_at
 from canwall.cycle.trip_text import latest_emergency, shown_state, trip_text
 from canwall.cycle.trips import Trip
 from canwall.drive import (
     Controlword,
-    DriveError,
     DriveState,
     Enabling,
     controlword_down,
@@ -33,7 +23,6 @@ from canwall.drive import (
 from canwall.drive import objects as od
 from canwall.errors import RunFailedError
 from canwall.record import Phase
-from canwall.supervised import Call
 
 #: Cycles within which a drive has to reach OPERATION ENABLED.
 _ENABLE_CYCLES = 2000
@@ -43,243 +32,15 @@ _LEAVE_S, _LEAVE_CYCLES = 0.1, 20
 _SILENT_CYCLES = 50
 #: SYNCs with RPDOs that disable a drive although it no longer seems to follow them.
 _LAST_RPDOS = 5
-#: Attempts to send NMT RESET NODE.
-_RESETS = 2
 #: States in which a drive gives no torque until it is enabled again.
 _DISABLED = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
 #: Cycles before enabling within which position and statusword have to arrive, and the least time
 #: in real time [s], in which master or drive may be delayed.
 _FIRST_CYCLES, _FIRST_S = 10, 0.2
-#: Time without a frame, a cycle or a turn of the bus after which a call counts as one that does not
-#: come back: if it waits, and if it computes, as the compiler does for long [s].
-_STANDSTILL_S, _COMPUTING_S = 3.0, 60.0
-#: Processor time after which a law counts as one that does not return: in real time [s, cycles],
-#: and in simulated time, where nothing waits for it [s].
-_LAW_S, _LAW_CYCLES, _SIMULATED_LAW_S = 0.02, 5, 0.5
-
-
-@dataclass
-class Outcome:
-    """End of a run."""
-
-    cycles: int = 0
-    interrupted: bool = False
-    trips: list[str] = field(default_factory=list)
-    trip_cycle: int | None = None
-    """Cycle at which a limit was exceeded, or a report ended the wall."""
-    disabled: bool = False
-    notes: list[str] = field(default_factory=list)
-    """Steps of the way out that the drives refused, although they are disabled."""
-    machine: dict[str, Grant] = field(default_factory=dict)
-    """What the machine has granted to the loop."""
-    error: BaseException | None = None
-    """Failure of the program itself, which is raised once all else is done."""
 
 
 class WallGivenUpError(RunFailedError):
     """End of a wall before its time; the text gives the reason."""
-
-
-def run_loop(
-    exchange: Exchange,
-    cycles: int | None,
-    stop: Callable[[], bool],
-    progress: Callable[[int], None] = lambda j: None,
-    prepared: AbstractContextManager[dict[str, Grant]] | None = None,
-    outcome: Outcome | None = None,
-) -> Outcome:
-    """Enable the drives, render the walls, disable the drives.
-
-    The loop has a thread of its own. The calling thread looks at its progress, and takes the drives
-    down over another link if it does not get on.
-
-    Args:
-        exchange: Exchange of frames with the drives.
-        cycles: Number of SYNCs with the wall rendered, None for a run until it is stopped.
-        stop: Called once a cycle, by the thread of the loop; True ends the run.
-        progress: Called with the cycle about every 100 ms of bus time, by the same thread.
-        prepared: Entered by the thread of the loop: the preparation of the machine.
-        outcome: Filled with the outcome, which is there even if an exception is raised.
-
-    Raises:
-        BaseException: A failure of the program itself, or KeyboardInterrupt if the caller does not
-            hold signals, once the drives have been taken down.
-    """
-    outcome = Outcome() if outcome is None else outcome
-    loop = Loop(exchange, stop, progress)
-    supervisor = _Supervisor(loop)
-    # A collection would stop the cycle for milliseconds; the loop creates no reference cycles.
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    try:
-        supervisor.supervise(cycles, prepared or nullcontext({}), outcome)
-    finally:
-        gc.enable()
-        gc.unfreeze()
-        outcome.cycles = loop.j
-    error = outcome.error or supervisor.interruption
-    if error is not None:
-        raise error
-    return outcome
-
-
-def _run(
-    loop: "Loop",
-    cycles: int | None,
-    prepared: AbstractContextManager[dict[str, Grant]],
-    outcome: Outcome,
-) -> None:
-    """Do what the thread of the loop has to do.
-
-    The outcome tells of all that fails but the ladder itself. Raises what that raises.
-    """
-    with prepared as outcome.machine:
-        try:
-            loop.warm_up()
-            loop.enable()
-            outcome.interrupted = loop.render(cycles)
-        except WallGivenUpError as trip:
-            outcome.trips.append(str(trip))
-            outcome.trip_cycle = loop.trip_cycle
-        except BaseException as error:
-            _tell(outcome, error)
-            outcome.trip_cycle = loop.j
-        finally:
-            _take_down(loop, outcome, partial(_attempt, loop), loop.leave)
-
-
-def _tell(outcome: Outcome, error: BaseException) -> None:
-    """Add an error to the trips; one of the program itself is kept as well."""
-    text = _named(error)
-    if text not in outcome.trips:
-        outcome.trips.append(text)
-    if not isinstance(error, (can.CanError, RunFailedError)):
-        outcome.error = outcome.error or error
-
-
-def _named(error: BaseException) -> str:
-    if isinstance(error, can.CanError):
-        return f"the bus failed: {error}"
-    if isinstance(error, RunFailedError):
-        return str(error)
-    return f"the program failed: {type(error).__name__}: {error}"
-
-
-#: Calls a rung of the ladder; returns what it raised, None if all went well.
-_Attempt = Callable[[Callable[[], object]], BaseException | None]
-
-
-def _attempt(loop: "Loop", rung: Callable[[], object]) -> BaseException | None:
-    """Try a rung of the ladder in this thread, unless another one has taken over."""
-    try:
-        loop.exchange.check_in_force()
-        rung()
-    except BaseException as error:
-        return error
-    return None
-
-
-def _take_down(
-    loop: "Loop", outcome: Outcome, attempt: _Attempt, first: Callable[[], object]
-) -> None:
-    """Disable the drives by RPDO; over SDO if that fails or a trip leaves doubt; at last by NMT.
-
-    Each rung is tried whatever the one before has raised.
-    """
-    failure = attempt(first)
-    if failure is None and loop.is_down and not outcome.trips:
-        outcome.disabled = True
-    else:
-        if failure is not None and _named(failure) not in outcome.trips:
-            _tell(outcome, failure)
-        elif not outcome.trips:
-            outcome.trips.append("the drive does not follow its RPDOs any more; SDO disabled it")
-        _take_down_without_cycle(loop, outcome, attempt)
-    if outcome.disabled:
-        failure = attempt(lambda: outcome.notes.extend(loop.disarm()))
-        if failure is not None:
-            outcome.notes.append(f"the drive's watchdog may stay set: {_named(failure)}")
-
-
-def _take_down_without_cycle(loop: "Loop", outcome: Outcome, attempt: _Attempt) -> None:
-    failure = attempt(loop.disable_over_sdo)
-    outcome.disabled = failure is None
-    if failure is None:
-        return
-    why = str(failure) if isinstance(failure, DriveError) else _named(failure)
-    was_sent = any(attempt(loop.reset) is None for _ in range(_RESETS))
-    sent = "was sent" if was_sent else "could not be sent"
-    outcome.trips.append(
-        f"the drive did not confirm that it is disabled ({why}), NMT RESET NODE {sent}: "
-        f"switch it off before you touch it"
-    )
-
-
-class _Supervisor:
-    """Looks at the loop from another thread, and takes the drives down if it does not get on.
-
-    Attributes:
-        interruption: What was raised in this thread meanwhile, KeyboardInterrupt for one.
-    """
-
-    def __init__(self, loop: "Loop") -> None:
-        self._loop = loop
-        self.interruption: BaseException | None = None
-
-    def supervise(
-        self,
-        cycles: int | None,
-        prepared: AbstractContextManager[dict[str, Grant]],
-        outcome: Outcome,
-    ) -> None:
-        """Have the loop run to its end, or to that of this thread's patience."""
-        loop, by_loop = self._loop, Outcome()
-        with real_time_priority(above_loop=True) if loop.real_time else nullcontext():
-            call = Call(lambda: _run(loop, cycles, prepared, by_loop), lambda: loop.progress)
-            why = self._attend(call, loop.hang)
-            # The thread of the loop may still come back, and have something to add.
-            ended = replace(by_loop, trips=[*by_loop.trips], notes=[*by_loop.notes])
-            vars(outcome).update(vars(ended))
-            if why:
-                outcome.trips.append(why)
-                loop.change_link()
-            elif call.error is not None:
-                _tell(outcome, call.error)
-            else:
-                return
-            if outcome.trip_cycle is None:
-                outcome.trip_cycle = loop.j
-            _take_down(loop, outcome, self._attempt, loop.send_zero)
-
-    def _attend(self, call: Call, hang: Callable[[Call], str]) -> str:
-        """Wait for the end of a call; return "", or why it was given up."""
-        while True:
-            try:
-                if call.has_ended():
-                    return ""
-                if why := hang(call):
-                    call.give_up()
-                    return why
-            except BaseException as interruption:
-                self.interruption = self.interruption or interruption
-                self._loop.interrupt()
-
-    def _attempt(self, rung: Callable[[], object]) -> BaseException | None:
-        """Try a rung of the ladder; the next one has another link if this one hangs."""
-        call = Call(rung, lambda: self._loop.progress)
-        why = self._attend(call, standstill)
-        if why:
-            self._loop.change_link()
-            return RunFailedError(why)
-        return call.error
-
-
-def standstill(call: Call) -> str:
-    """Return why a call counts as one that does not come back, empty if it does not."""
-    if call.waited_s < _STANDSTILL_S and call.computed_s < _COMPUTING_S:
-        return ""
-    return f"no answer from {call.place()} for {call.waited_s + call.computed_s:.2g} s"
 
 
 class Loop:
@@ -332,19 +93,22 @@ class Loop:
         """End the wall as `stop` would; another thread may call this."""
         self._interrupted = True
 
-    def _stops(self) -> bool:
+    def stops(self) -> bool:
+        """Return True if the run is to end."""
         return self._interrupted or self._stop()
 
-    def hang(self, call: Call) -> str:
-        """Return why the loop counts as hanging, with the law that does not return; else empty."""
-        limit_s = max(_LAW_S, _LAW_CYCLES * self._period) if self.real_time else _SIMULATED_LAW_S
+    @property
+    def period_s(self) -> float:
+        """Period of the SYNC [s]."""
+        return self._period
+
+    def law_at_work(self) -> str:
+        """Return cycle and law that is being evaluated; empty if none is."""
         for axis in self._axes:
-            evaluated = int(axis.cycle["evaluated"][0])
-            if evaluated and call.computed_s >= limit_s:
-                name = axis.laws[evaluated - 1].name
-                text = f"law {name} has not returned for {call.computed_s:.2g} s"
-                return self._say(axis, f"cycle {self.j} ({self.j * self._period:.3f} s): {text}")
-        return standstill(call)
+            if evaluated := int(axis.cycle["evaluated"][0]):
+                name, at = axis.laws[evaluated - 1].name, self.j * self._period
+                return self._say(axis, f"cycle {self.j} ({at:.3f} s): law {name}")
+        return ""
 
     def change_link(self) -> None:
         """Leave the present link to a call that does not come back, and use another one."""
@@ -373,7 +137,7 @@ class Loop:
         self._first_positions()
         ways = [Enabling() for _ in self._axes]
         for _ in range(_ENABLE_CYCLES):
-            if self._stops():
+            if self.stops():
                 return
             enabled = [_advance_enabling(*pair) for pair in zip(self._axes, ways, strict=True)]
             if all(enabled):
@@ -412,7 +176,7 @@ class Loop:
 
         Raises WallGivenUpError at a trip.
         """
-        if self._stops() or self._measure_delays():
+        if self._measure_delays():
             return True
         for axis in self._axes:
             # The handle may be inside the wall, so the force fades in.
@@ -420,7 +184,7 @@ class Loop:
         self._enter(Phase.RENDERING)
         pending = [(axis, list(axis.changes)) for axis in self._axes]
         while cycles is None or self.j < cycles:
-            if self._stops():
+            if self.stops():
                 return True
             for axis, changes in pending:
                 _change(axis, changes, self._period)
@@ -450,7 +214,7 @@ class Loop:
             return False
         self._enter(Phase.MEASURING)
         for _ in range(max(test.cycles for test in tests)):
-            if self._stops():
+            if self.stops():
                 return True
             for test in tests:
                 test.excite()

@@ -126,7 +126,7 @@ def render(
     cycles = None if end_s is None else round(end_s / period)
     return run_loop(
         exchange,
-        cycles,
+        lambda loop: loop.render(cycles),
         stop,
         lambda j: progress(j * period),
         _prepared_machine(settings),

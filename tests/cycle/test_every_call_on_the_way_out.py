@@ -88,7 +88,7 @@ def render(rig: Rig, fault: Fault, before: Callable[[Loop], None], outcome: Outc
         patch.setattr(loop_module.Loop, "leave", begin)
         threading.setprofile(fault)
         try:
-            run_loop(loop.exchange, CYCLES, lambda: False, outcome=outcome)
+            run_loop(loop.exchange, lambda loop: loop.render(CYCLES), outcome=outcome)
         finally:
             threading.setprofile(None)
             fault.armed = False
@@ -121,7 +121,7 @@ WAYS = {way.__name__: way for way in (in_order, failing, deaf)}
 @pytest.fixture(autouse=True)
 def _no_long_waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(exchange_module, "_SIMULATED_TIMEOUT_S", 1.0)
-    monkeypatch.setattr(loop_module, "_STANDSTILL_S", 0.3)
+    monkeypatch.setattr("canwall.cycle.way_out._STANDSTILL_S", 0.3)
     monkeypatch.setattr(
         "rig.load_eds", functools.cache(rig_module.load_eds)
     )  # most of a rig's time

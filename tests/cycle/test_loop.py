@@ -570,7 +570,7 @@ def test_exchange_that_fails_for_good_is_left_by_sdo(make_rig: RigFactory) -> No
         return False
 
     with pytest.raises(ValueError, match="no cycle any more"):
-        run_loop(loop.exchange, None, fail_from_now_on, outcome=outcome)
+        run_loop(loop.exchange, lambda loop: loop.render(None), fail_from_now_on, outcome=outcome)
     assert outcome.trips == ["the program failed: ValueError: no cycle any more"]
     assert outcome.disabled
     assert loop.rig.node.read(0x6041) & 0x6F == 0x40

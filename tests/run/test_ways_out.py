@@ -387,17 +387,17 @@ def test_law_that_does_not_return_in_real_time(start: Start, tmp_path: Path, exc
 IMPATIENT = """
 import signal, sys
 from canwall import cli
-from canwall.cycle import loop
+from canwall.cycle.loop import Loop
 
-hang = loop.Loop.hang
+law_at_work = Loop.law_at_work
 
-def signals(self, call):
-    if self.exchange.axes[0].cycle["evaluated"][0]:
+def signals(self):
+    if found := law_at_work(self):
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGTERM)
-    return hang(self, call)
+    return found
 
-loop.Loop.hang = signals
+Loop.law_at_work = signals
 sys.argv = ["canwall", *sys.argv[1:]]
 cli.main()
 """
@@ -417,14 +417,15 @@ def test_signals_while_a_law_does_not_return(tmp_path: Path) -> None:
 
 TAIL = """
 import signal, sys
+from pathlib import Path
+import canwall
 from canwall import cli
-from canwall.cycle import loop
 from canwall.run import running
 
-noisy = {noisy!r}
+noisy, package = {noisy!r}, str(Path(canwall.__file__).parent)
 
 def signals(frame, event, argument):
-    if event == "call" and "canwall" in frame.f_code.co_filename:
+    if event == "call" and frame.f_code.co_filename.startswith(package):
         signal.raise_signal(signal.SIGTERM)
         signal.raise_signal(signal.SIGINT)
 

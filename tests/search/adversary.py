@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from rig import RPDO1, SDO_ANSWER, SYNC, TPDO1, Loop, Rig, settings_with
 
 import canwall.cycle.exchange
-import canwall.cycle.loop
+import canwall.cycle.way_out
 import canwall.drive.setup
 import canwall.simdrive.communication.dictionary as drive_dictionary
 from canwall.config import Settings
@@ -316,7 +316,7 @@ def fast_duels() -> Iterator[None]:
         patch.object(canwall.drive.setup, "_DISABLING_S", 0.01),
         patch.object(exchange, "_SIMULATED_TIMEOUT_S", 0.005),
         patch.object(exchange, "_MISSING_TIMEOUT_S", 0.0005),
-        patch.object(canwall.cycle.loop, "gc", _no_collection()),
+        patch.object(canwall.cycle.way_out, "gc", _no_collection()),
         patch.object(canopen.sdo.SdoClient, "RESPONSE_TIMEOUT", 0.005),
     ):
         yield
