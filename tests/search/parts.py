@@ -136,7 +136,7 @@ PARTS = {
     "belief": Part(
         belief.pairs,
         5_000,
-        100,
+        40,
         "No pair of a drive's state and its master's belief has a torque and no master in its"
         " cycle, whatever is lost, late, doubled, reordered or forged.",
     ),
