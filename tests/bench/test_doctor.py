@@ -7,6 +7,7 @@ from commands import command, config_file
 from rig import SIM_CONFIG, Rig, RigFactory, settings_with
 
 from canwall.bench import Findings, examine
+from canwall.cycle import Exchange
 from canwall.drive import REQUIRED_OBJECTS, DriveError, DriveNode
 
 SETTINGS = {"drive.wait_s": 0.0, "drive.watchdog_s": 0.2}
@@ -113,6 +114,24 @@ def test_a_drive_that_fails_is_put_back_as_well(rig: Rig) -> None:
     with pytest.raises(DriveError, match="no TPDO within"):
         examined(rig)
     assert rig.node.read(0x6007) == before
+
+
+@pytest.mark.parametrize("kind", [ValueError, KeyboardInterrupt])
+def test_cycle_that_fails_leaves_the_drive_disabled(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, kind: type[BaseException]
+) -> None:
+    cycle = Exchange.cycle
+
+    def failing(exchange: Exchange, most: int = 1) -> None:
+        if exchange.axes[0].cycle["statusword"][0] & 0x6F == 0x27:
+            raise kind("of the test")
+        cycle(exchange, most)
+
+    monkeypatch.setattr(Exchange, "cycle", failing)
+    with pytest.raises(kind, match="of the test"):
+        examined(rig)
+    assert rig.node.read(0x6041) & 0x6F == 0x40
+    assert rig.node.read(0x6071) == 0
 
 
 @pytest.mark.slow
