@@ -7,7 +7,7 @@ from pydantic import Field
 from canwall.config.drive import Objects, by_index
 from canwall.config.fault import Fault
 from canwall.config.hand import Hand
-from canwall.config.section import Array, FilePath, Interval, NonNegative, Positive, Section
+from canwall.config.section import Array, FilePath, Interval, NonNegative, Number, Positive, Section
 
 
 class Simulation(Section):
@@ -22,8 +22,15 @@ class Simulation(Section):
 
     The motor's cogging torque is a triangle wave of amplitude `cogging_nm`, with `cogs_per_rev`
     periods per revolution. The current loop is a first-order lag of `current_bandwidth_hz` (0: no
-    lag) with a resolution of `torque_step_nm` (0: exact). The velocity (0x606C) is the difference
-    of the encoder over one period, low-pass filtered with `velocity_filter_hz` (0: unfiltered).
+    lag) with a resolution of `torque_step_nm` (0: exact). The motor delivers 1 +
+    `torque_constant_error` of the torque that the drive believes and shows (0x6077). The velocity
+    (0x606C) is the difference of the encoder over one period, low-pass filtered with
+    `velocity_filter_hz` (0: unfiltered).
+
+    The drive has a control cycle of its own, `drive_cycle_s` (0: none), whose clock is fast by
+    `clock_ppm` against the SYNC. At its ticks it latches position and torque for the next TPDO,
+    and puts into force the torque that has come. At the start, `clock_phase` of a cycle is left
+    until the next tick.
 
     Time advances by one `[bus] cycle_s` per SYNC or, with `real_time`, by the clock. The torque of
     an RPDO acts `torque_delay_cycles` periods after the SYNC (synchronous types) or after its
@@ -40,6 +47,10 @@ class Simulation(Section):
     cogs_per_rev: int = Field(24, ge=1, le=10_000)
     current_bandwidth_hz: Annotated[NonNegative, Field(le=1e6)] = 0.0
     torque_step_nm: NonNegative = 0.0003
+    torque_constant_error: Annotated[Number, Field(gt=-1.0, le=1.0)] = 0.0
+    drive_cycle_s: Annotated[NonNegative, Field(le=0.1)] = 0.0
+    clock_ppm: Annotated[Number, Field(ge=-1e4, le=1e4)] = 0.0
+    clock_phase: Annotated[NonNegative, Field(le=1.0)] = 0.5
     velocity_filter_hz: NonNegative = 200.0
     peak_torque_nm: Positive | None = None
     overload_s: NonNegative = 3.0
@@ -59,6 +70,15 @@ class Simulation(Section):
         return by_index(self.objects)
 
     def with_ideal_servo(self) -> Self:
-        """Return the same mechanics without cogging, torque steps and lag of the motor."""
-        ideal = {"cogging_nm": 0.0, "torque_step_nm": 0.0, "current_bandwidth_hz": 0.0}
+        """Return the same mechanics with an ideal motor and drive.
+
+        Without cogging, torque steps, lag, error of the torque constant and drive cycle.
+        """
+        ideal = {
+            "cogging_nm": 0.0,
+            "torque_step_nm": 0.0,
+            "current_bandwidth_hz": 0.0,
+            "torque_constant_error": 0.0,
+            "drive_cycle_s": 0.0,
+        }
         return self.model_copy(update=ideal)
