@@ -51,6 +51,7 @@ def handle_plant(simulation: Simulation) -> dict[str, float]:
         "mass": simulation.inertia_kg_m2,
         "viscous": simulation.viscous_nm_s_per_rad,
         "coulomb": simulation.coulomb_nm,
+        "stiction": simulation.breakaway_nm,
         "cogging": simulation.cogging_nm,
         "cog_pitch": 2.0 * math.pi / simulation.cogs_per_rev,
     }
