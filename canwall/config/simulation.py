@@ -1,13 +1,25 @@
 """`[simulation]`: the mechanics of the simulated drive, and the hand on its handle."""
 
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from canwall.config.drive import Objects, by_index
 from canwall.config.fault import Fault
 from canwall.config.hand import Hand
-from canwall.config.section import Array, FilePath, Interval, NonNegative, Positive, Section
+from canwall.config.section import Array, FilePath, Interval, NonNegative, Number, Positive, Section
+
+
+#: What `ideal = true` stands for, whatever the keys themselves say.
+_IDEAL: dict[str, Any] = {
+    "ideal": True,
+    "stiction_nm": None,
+    "cogging_nm": 0.0,
+    "torque_step_nm": 0.0,
+    "current_bandwidth_hz": 0.0,
+    "torque_constant_error": 0.0,
+    "drive_cycle_s": 0.0,
+}
 
 
 class Simulation(Section):
@@ -20,10 +32,21 @@ class Simulation(Section):
     limit switches are closed outside `limit_switches_rad`, the home switch within
     `home_switch_rad`. Parameters stored through 0x1010 are kept in the file `store`, if given.
 
-    The motor's cogging torque is a triangle wave of amplitude `cogging_nm`, with `cogs_per_rev`
+    Friction is `coulomb_nm` in motion; at rest it holds up to `stiction_nm`, at least as much and
+    by default the same. The motor's cogging torque is a triangle wave of amplitude `cogging_nm`, with `cogs_per_rev`
     periods per revolution. The current loop is a first-order lag of `current_bandwidth_hz` (0: no
-    lag) with a resolution of `torque_step_nm` (0: exact). The velocity (0x606C) is the difference
-    of the encoder over one period, low-pass filtered with `velocity_filter_hz` (0: unfiltered).
+    lag) with a resolution of `torque_step_nm` (0: exact). The motor delivers 1 +
+    `torque_constant_error` of the torque that the drive believes and shows (0x6077). The velocity
+    (0x606C) is the difference of the encoder over one period, low-pass filtered with
+    `velocity_filter_hz` (0: unfiltered).
+
+    The drive has a control cycle of its own, `drive_cycle_s` (0: none), whose clock is fast by
+    `clock_ppm` against the SYNC. At its ticks it latches position and torque for the next TPDO,
+    and puts into force the torque that has come. At the start, `clock_phase` of a cycle is left
+    until the next tick.
+
+    `ideal` makes motor and drive ideal, whatever these keys say: no cogging, no torque steps, no
+    lag, no error of the torque constant, no drive cycle, no stiction beyond Coulomb friction.
 
     Time advances by one `[bus] cycle_s` per SYNC or, with `real_time`, by the clock. The torque of
     an RPDO acts `torque_delay_cycles` periods after the SYNC (synchronous types) or after its
@@ -36,10 +59,15 @@ class Simulation(Section):
     inertia_kg_m2: Positive = 1.0e-4
     viscous_nm_s_per_rad: NonNegative = 5.0e-4
     coulomb_nm: NonNegative = 0.01
+    stiction_nm: NonNegative | None = None
     cogging_nm: NonNegative = 0.003
     cogs_per_rev: int = Field(24, ge=1, le=10_000)
     current_bandwidth_hz: Annotated[NonNegative, Field(le=1e6)] = 0.0
     torque_step_nm: NonNegative = 0.0003
+    torque_constant_error: Annotated[Number, Field(gt=-1.0, le=1.0)] = 0.0
+    drive_cycle_s: Annotated[NonNegative, Field(le=0.1)] = 0.0
+    clock_ppm: Annotated[Number, Field(ge=-1e4, le=1e4)] = 0.0
+    clock_phase: Annotated[NonNegative, Field(le=1.0)] = 0.5
     velocity_filter_hz: NonNegative = 200.0
     peak_torque_nm: Positive | None = None
     overload_s: NonNegative = 3.0
@@ -49,6 +77,7 @@ class Simulation(Section):
     store: FilePath | None = None
     real_time: bool = False
     torque_delay_cycles: Annotated[NonNegative, Field(le=1000.0)] = 0.0
+    ideal: bool = False
     seed: int = Field(0, ge=0)
     hand: Hand = Hand()
     fault: Array[tuple[Fault, ...]] = ()
@@ -58,7 +87,26 @@ class Simulation(Section):
         """`objects` by index and sub-index."""
         return by_index(self.objects)
 
+    @property
+    def breakaway_nm(self) -> float:
+        """Torque that sets the handle in motion from rest."""
+        return self.coulomb_nm if self.stiction_nm is None else self.stiction_nm
+
     def with_ideal_servo(self) -> Self:
-        """Return the same mechanics without cogging, torque steps and lag of the motor."""
-        ideal = {"cogging_nm": 0.0, "torque_step_nm": 0.0, "current_bandwidth_hz": 0.0}
-        return self.model_copy(update=ideal)
+        """Return the same mechanics with an ideal motor and drive, as `ideal` makes them."""
+        return self.model_copy(update=_IDEAL)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _idealise(cls, values: Any) -> Any:
+        ideal = isinstance(values, dict) and values.get("ideal") is True
+        return values | _IDEAL if ideal else values
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.breakaway_nm < self.coulomb_nm:
+            raise ValueError(
+                f"stiction_nm: has to be at least coulomb_nm, {self.coulomb_nm}, "
+                f"not {self.stiction_nm}"
+            )
+        return self

@@ -6,6 +6,7 @@ energy of the relative motion is lost.
 """
 
 import math
+import sys
 from typing import NamedTuple
 
 from canwall.compiled import Record, compiled
@@ -52,6 +53,9 @@ class Grasp(NamedTuple):
     hand_v: float
     touching: bool
 
+
+#: Speed of a handle that has just broken loose; small enough to add nothing.
+_LEAST_SPEED = sys.float_info.min
 
 #: Bound of the steps towards the closing of a gap; far more than rounding allows.
 _MAX_STEPS = 10_000
@@ -131,6 +135,8 @@ def _move_together(
             return remaining, Grasp(y, v, y, v, True)
     event = _contact_force_event(hand, shifted(script, stuck))
     if event_value(motion, event, 0, 0.0)[0] < 0.0:
+        # Loose from its stiction, the handle would stick anew if it were at rest without the hand.
+        v = direction * _LEAST_SPEED if stuck > 0.0 else v
         return stuck, Grasp(y, v, y, v, False)
     dt, y, v = move_to_event(piece, motion, direction, remaining - stuck)
     parting = first_sign_change(motion, event, 1.0, dt)

@@ -25,11 +25,13 @@ from canwall.physics.smooth import (
     SmoothMotion,
     find_root,
     first_sign_change,
+    largest_acceleration,
     shifted,
     state_at,
 )
 
-#: Parameters of a handle. Inside the wall (y < 0) wall_stiffness K and wall_damping B add to spring
+#: Parameters of a handle. It moves against `coulomb`, and from rest once the force on it exceeds
+#: `stiction`. Inside the wall (y < 0) wall_stiffness K and wall_damping B add to spring
 #: and viscous damping. The cogging torque is a triangle wave over y + cog_origin with amplitude
 #: `cogging` and period `cog_pitch`; it pulls towards 0 about 0 and conserves energy. Units are any
 #: consistent set, SI in this project.
@@ -39,6 +41,7 @@ PLANT = np.dtype(
         ("viscous", "f8"),
         ("spring", "f8"),
         ("coulomb", "f8"),
+        ("stiction", "f8"),
         ("wall_stiffness", "f8"),
         ("wall_damping", "f8"),
         ("cogging", "f8"),
@@ -64,6 +67,7 @@ def make_plant(
     wall_damping: float = 0.0,
     cogging: float = 0.0,
     cog_pitch: float = 1.0,
+    stiction: float | None = None,
 ) -> NDArray[np.void]:
     """Make a plant for compiled code.
 
@@ -76,14 +80,20 @@ def make_plant(
         wall_damping: Damping B of the wall.
         cogging: Amplitude of the cogging torque.
         cog_pitch: Its period.
+        stiction: Friction that holds at rest. Default: Coulomb friction.
 
     Returns:
         Array of shape (1,), dtype PLANT.
 
     Raises:
-        ValueError: Unless mass and cog_pitch are > 0, the rest ≥ 0, and all finite.
+        ValueError: Unless mass and cog_pitch are > 0, the rest ≥ 0, all finite, and stiction ≥
+            coulomb.
     """
-    values = (mass, viscous, spring, coulomb, wall_stiffness, wall_damping, cogging, cog_pitch)
+    holds = coulomb if stiction is None else stiction
+    wall = (wall_stiffness, wall_damping)
+    values = (mass, viscous, spring, coulomb, holds, *wall, cogging, cog_pitch)
+    if holds < coulomb:
+        raise ValueError(f"a plant needs a stiction of at least {coulomb}, not {holds}")
     if not all(math.isfinite(x) and x >= 0.0 for x in values) or mass == 0.0 or cog_pitch == 0.0:
         raise ValueError(f"a plant needs mass > 0 and finite parameters ≥ 0, not {values}")
     return np.array([(*values, 0.0)], dtype=PLANT)
@@ -167,7 +177,7 @@ def linear_piece(plant: Record, y: float, v: float, u: float) -> tuple[Piece, bo
 
 @compiled
 def _time_to_break_loose(
-    pull: float, coulomb: float, force: Force, horizon: float
+    pull: float, stiction: float, force: Force, horizon: float
 ) -> tuple[float, float]:
     """Return when the force on a stuck handle exceeds its friction, and in which direction.
 
@@ -177,12 +187,12 @@ def _time_to_break_loose(
         if force.slope == 0.0:
             return math.inf, 0.0
         direction = 1.0 if force.slope > 0.0 else -1.0
-        return max(coulomb - direction * pull, 0.0) / abs(force.slope), direction
+        return max(stiction - direction * pull, 0.0) / abs(force.slope), direction
     # The acceleration of a free unit mass is the force, so the remaining friction is an event
     # function of its motion.
     free = SmoothMotion(1.0, 0.0, 0.0, 0.0, 0.0, pull, force.slope, force.excess, force.rate)
-    up = first_sign_change(free, EventFunction(coulomb, 0.0, 0.0, 0.0, -1.0), 1.0, horizon)
-    down = first_sign_change(free, EventFunction(coulomb, 0.0, 0.0, 0.0, 1.0), 1.0, horizon)
+    up = first_sign_change(free, EventFunction(stiction, 0.0, 0.0, 0.0, -1.0), 1.0, horizon)
+    down = first_sign_change(free, EventFunction(stiction, 0.0, 0.0, 0.0, 1.0), 1.0, horizon)
     return (up, 1.0) if up <= down else (down, -1.0)
 
 
@@ -206,14 +216,14 @@ def motion_from(
         constant = u - direction * plant.coulomb
         # Test the values that the flow will get: one that rounds to the other side of the
         # threshold would reverse at once, and time would not advance.
-        if direction * (constant - spring * y) <= 0.0:
+        if direction * (u - direction * plant.stiction - spring * y) <= 0.0:
             # Stuck until the external force breaks it loose, if ever.
-            stuck, direction = _time_to_break_loose(pull, plant.coulomb, force, horizon)
+            stuck, direction = _time_to_break_loose(pull, plant.stiction, force, horizon)
             if stuck < horizon:
                 force = shifted(force, stuck)
-            # Friction and spring balance exactly here; recomputed from the force, the acceleration
+            # Stiction and spring balance exactly here; recomputed from the force, the acceleration
             # could have the wrong sign by rounding and end the slip at once.
-            constant = spring * y
+            constant = spring * y + direction * (plant.stiction - plant.coulomb)
     motion = SmoothMotion(
         plant.mass,
         piece.viscous,
@@ -237,6 +247,8 @@ def _reversal(
     span is at most a quarter period, (y_end, v_end) the state at its end.
     """
     if motion.excess != 0.0:
+        if abs(motion.v) > largest_acceleration(motion, span) * span:
+            return span
         return min(first_sign_change(motion, VELOCITY, direction, span), span)
     # Without a lag the acceleration has at most one zero, and the velocity is monotone on either
     # side of it.
@@ -322,8 +334,8 @@ def advance(
 ) -> tuple[float, float, bool]:
     """Return the state after `duration` under u₀ + u₁·t − excess·(1 − exp(−rate·t)).
 
-    Coulomb friction is set-valued at rest: the handle sticks while the force on it stays within
-    ±coulomb, and starts to slip at the instant at which it no longer does.
+    Friction is set-valued at rest: the handle sticks while the force on it stays within
+    ±stiction, and starts to slip at the instant at which it no longer does.
 
     Args:
         plant: Handle and wall, a record of dtype PLANT.

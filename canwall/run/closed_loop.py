@@ -21,11 +21,11 @@ from canwall.drive import objects as od
 from canwall.record import ROW, Phase
 from canwall.simdrive import (
     ServoScales,
-    encoder_counts,
     hand_force,
     make_servo,
     move_servo,
     servo_scales,
+    shows_its_torque,
 )
 from canwall.units import DriveUnits
 from canwall.walls import MAX_DELAY
@@ -175,7 +175,7 @@ class ClosedLoop:
         setup = DriveSetup(self.units, 0, _TPDO, _RPDO, torque_limit_nm=limit_nm)
         self._cycle = make_cycle(settings, setup, run_laws(settings))
         self._servo = make_servo(simulation, scales.counts_per_rev)
-        start_at(self._cycle, encoder_counts(self._servo))
+        start_at(self._cycle, int(self._servo["latched_counts"][0]))
         self._cycle["phase"] = Phase.ENABLING
         fade_in(self._cycle, round(settings.run.ramp_in_s / settings.bus.cycle_s))
         delay = loop_delay(settings)
@@ -316,7 +316,8 @@ def _run_cycles(loop: LoopRecords, rows: NDArray[np.void], signals: Array) -> in
     cycles, servos, push, slope = loop.cycle, loop.servo, loop.push, loop.slope
     nm_per_mille, whole, share = loop.nm_per_mille, loop.whole, loop.share
     cycle: Record = cycles[0]
-    period, counts = cycle.period, encoder_counts(servos)
+    servo: Record = servos[0]
+    period, counts = cycle.period, servo.latched_counts
     late, skipped = loop.late, loop.skipped
     data = data_before = 0
     # Torques in per mille that are on their way: sent[k] was computed k samples ago.
@@ -327,6 +328,8 @@ def _run_cycles(loop: LoopRecords, rows: NDArray[np.void], signals: Array) -> in
             cycle.phase = _RENDERING
         # The drive shows the torque that acts at the SYNC, not the one that is still on its way.
         shown = sent[whole] if share > 0.0 or whole == 0 else sent[whole - 1]
+        if shows_its_torque(servos):
+            shown = int(np.rint(servo.latched_torque / nm_per_mille))
         data_before = data
         data = (counts & 0xFFFFFFFF) | (_ENABLED << 32) | ((shown & 0xFFFF) << 48)
         taken = data_before if late[j] else data

@@ -9,12 +9,12 @@ from canwall.simdrive.mechanics.hand import hand_force
 from canwall.simdrive.mechanics.motion import ServoMotion
 from canwall.simdrive.mechanics.servo import (
     SERVO,
-    encoder_counts,
     hand_body,
     hand_plant,
     handle_plant,
     make_servo,
     move_servo,
+    shows_its_torque,
 )
 from canwall.simdrive.profile.power_drive_system import Motion
 from canwall.simdrive.runner import BusRunner, Device
@@ -33,7 +33,6 @@ __all__ = [
     "ServoScales",
     "SimulatedDrive",
     "SocketRunner",
-    "encoder_counts",
     "hand_body",
     "hand_force",
     "hand_plant",
@@ -42,4 +41,5 @@ __all__ = [
     "make_servo",
     "move_servo",
     "servo_scales",
+    "shows_its_torque",
 ]

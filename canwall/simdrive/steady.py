@@ -14,6 +14,7 @@ from canwall.compiled import Record, compiled
 from canwall.simdrive.communication.rpdo import keep_until_sync, restart_event_timer
 from canwall.simdrive.communication.sync import begin_cycle
 from canwall.simdrive.mechanics.motion import MOTION, advance_motion, has_script
+from canwall.simdrive.mechanics.servo import SERVO, shows_its_torque
 from canwall.simdrive.profile.feedback import latch
 from canwall.simdrive.profile.overload import used_after, warns
 from canwall.simdrive.profile.torque import demanded_nm, limited, show_torque
@@ -101,9 +102,9 @@ def _take_sync(drives: NDArray[np.void]) -> int:
     drive.used, drive.held = used, torque
     values[TARGET_TORQUE] = target
     values[TORQUE_DEMAND] = values[TORQUE] = values[CURRENT] = torque
-    servo = motion.servo[0]
-    if servo.lag_rate > 0.0:
-        show_torque(drives, servo.torque)
+    servos = elements(motion.servo.ctypes.data, 1, SERVO)
+    if shows_its_torque(servos):
+        show_torque(drives, servos[0].latched_torque)
     latch(drives, motion.counts, motion.counts_per_s)
     for k in range(drive.sync_tpdo_count):
         _pack(drive, drive.tpdos[drive.sync_tpdos[k]])

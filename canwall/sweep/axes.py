@@ -36,7 +36,7 @@ NAMED = {
     "operator": ("", "operator at the handle"),
     "model": ("", "model of the laws: matched, drive, file"),
     "model_error": ("1", "relative error of the model's inertia"),
-    "servo": ("", "file: as configured; ideal: no cogging, no torque steps, no lag"),
+    "servo": ("", "file: as configured; ideal: as with simulation.ideal"),
     "speed": ("rad/s", "mean speed of the hand's approach"),
     "phase": ("1", "phase of the contact relative to the SYNC"),
     "start": ("rad", "distance from the wall at which the handle rests before the strike"),

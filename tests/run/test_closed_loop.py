@@ -82,6 +82,15 @@ VARIANTS: list[dict[str, Any]] = [
     {"limits.torque_rate_nm_per_s": 50.0},
     {"wall.position_rad": 0.12, "run.ramp_in_s": 0.1},
     {"estimator.delay_cycles": 1.3},
+    {"simulation.current_bandwidth_hz": 1600.0},
+    {
+        "simulation.current_bandwidth_hz": 1600.0,
+        "simulation.drive_cycle_s": 0.00025,
+        "simulation.clock_ppm": 50.0,
+        "simulation.torque_constant_error": 0.05,
+        "simulation.torque_delay_cycles": 0.4,
+    },
+    {"simulation.drive_cycle_s": 0.0015, "simulation.clock_ppm": -300.0},
 ]
 
 

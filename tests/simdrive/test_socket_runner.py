@@ -71,7 +71,12 @@ def assert_same(ours: Any, theirs: Any) -> None:
         {"wall.law": "half_sample"},
         # Beyond the rated torque: limits and I²t.
         {"wall.law": "standard", "limits.torque_error_nm": 0.0, "simulation.overload_s": 0.02},
-        {"wall.law": "mean_force", "simulation.current_bandwidth_hz": 500.0},
+        {
+            "wall.law": "mean_force",
+            "simulation.current_bandwidth_hz": 500.0,
+            "simulation.drive_cycle_s": 0.00025,
+            "simulation.clock_ppm": 50.0,
+        },
         {"wall.law": "half_sample", "simulation.velocity_filter_hz": 100.0},
         # Not in steady operation.
         {"wall.law": "half_sample", "simulation.torque_delay_cycles": 0.5},

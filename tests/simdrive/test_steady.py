@@ -104,6 +104,7 @@ ACTIONS = {
         {},
         {"overload_s": 0.02, "velocity_filter_hz": 80.0},
         {"current_bandwidth_hz": 400.0, "torque_step_nm": 0.002},
+        {"drive_cycle_s": 0.0004, "clock_ppm": 100.0, "current_bandwidth_hz": 1600.0},
         {"hand": Hand(grip=False, strikes=5)},
         {"objects": {"0x607E": 0xE0}},
     ],

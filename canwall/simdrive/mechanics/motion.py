@@ -10,7 +10,7 @@ from canwall.bus.raw_socket import elements
 from canwall.compiled import Record, compiled, fields
 from canwall.config import Simulation
 from canwall.simdrive.mechanics.hand import hand_force
-from canwall.simdrive.mechanics.servo import SERVO, encoder_counts, make_servo, move_servo
+from canwall.simdrive.mechanics.servo import SERVO, make_servo, move_servo, shows_its_torque
 
 _REACHED = 1.0 - 1e-9
 """Share of a period after which it is over: its parts may miss the whole by a rounding."""
@@ -101,7 +101,6 @@ class ServoMotion:
     def __init__(self, simulation: Simulation, period_s: float, counts_per_rev: float) -> None:
         self._hand = simulation.hand
         self._period_s = period_s
-        self._lags = simulation.current_bandwidth_hz > 0.0
         self._motion = np.zeros(1, MOTION)
         self._motion["servo"][0] = make_servo(simulation, counts_per_rev)
         self._fields: Record = fields(self._motion)
@@ -109,8 +108,8 @@ class ServoMotion:
         filtered = simulation.velocity_filter_hz
         smoothing = -math.expm1(-2.0 * math.pi * filtered * period_s) if filtered else 1.0
         self._fields.period, self._fields.smoothing = period_s, smoothing
-        counts = int(encoder_counts(self._motion["servo"][0]))
-        self._fields.counts = self._fields.counts_before = counts
+        self._shows_its_torque = bool(shows_its_torque(self._motion["servo"][0]))
+        self._fields.counts = self._fields.counts_before = self._servo.latched_counts
         self._lay_out()
 
     def _lay_out(self) -> None:
@@ -140,7 +139,7 @@ class ServoMotion:
         return bool(self._servo.touching)
 
     def counts(self) -> int:
-        """Return the encoder position [increments], the nearest one."""
+        """Return the encoder position that the drive knows [increments]."""
         return int(self._fields.counts)
 
     def speed_counts_per_s(self) -> float:
@@ -152,8 +151,11 @@ class ServoMotion:
         return float(self._fields.counts_per_s)
 
     def torque_nm(self) -> float | None:
-        """Return the torque that the current loop delivers now; None where it follows at once."""
-        return float(self._servo.torque) if self._lags else None
+        """Return the torque that the drive believes to deliver; None where it follows at once.
+
+        That of now, or with a drive cycle that of its last tick.
+        """
+        return float(self._servo.latched_torque) if self._shows_its_torque else None
 
     def advance(self, torque_nm: float, duration_s: float) -> None:
         """Move on by any time under a torque that is demanded meanwhile."""

@@ -12,8 +12,10 @@ from canwall.compiled import Record, compiled
 from canwall.config import Simulation
 from canwall.physics import PLANT, Force, Grasp, HandBody, advance, advance_grasp, make_plant
 
-#: Plants (the handle alone, and joined with the hand), the hand as a separate body, the current
-#: loop, and the state: position and velocity of handle and hand, torque of the motor. SI units.
+#: Plants (the handle alone, and joined with the hand), the hand as a separate body, current loop,
+#: control cycle and clock of the drive, and the state: position and velocity of handle and hand,
+#: torque in force in the drive, torque that its current loop believes to deliver, time until its
+#: next tick; encoder and torque as latched at the last one. Times are by the clock of the SYNC. SI.
 SERVO = np.dtype(
     [
         ("handle", PLANT, (1,)),
@@ -25,13 +27,19 @@ SERVO = np.dtype(
         ("hand_side", "f8"),
         ("lag_rate", "f8"),
         ("torque_step", "f8"),
+        ("torque_gain", "f8"),
+        ("drive_cycle", "f8"),
         ("counts_per_rad", "f8"),
         ("y", "f8"),
         ("v", "f8"),
         ("hand_y", "f8"),
         ("hand_v", "f8"),
         ("touching", "?"),
+        ("demand", "f8"),
         ("torque", "f8"),
+        ("until_tick", "f8"),
+        ("latched_counts", "i8"),
+        ("latched_torque", "f8"),
     ],
     align=True,
 )
@@ -43,6 +51,7 @@ def handle_plant(simulation: Simulation) -> dict[str, float]:
         "mass": simulation.inertia_kg_m2,
         "viscous": simulation.viscous_nm_s_per_rad,
         "coulomb": simulation.coulomb_nm,
+        "stiction": simulation.breakaway_nm,
         "cogging": simulation.cogging_nm,
         "cog_pitch": 2.0 * math.pi / simulation.cogs_per_rev,
     }
@@ -77,17 +86,29 @@ def make_servo(simulation: Simulation, counts_per_rev: float) -> NDArray[np.void
     servo["hand_spring"], servo["hand_side"] = body.spring, body.side
     servo["lag_rate"] = 2.0 * math.pi * simulation.current_bandwidth_hz
     servo["torque_step"] = simulation.torque_step_nm
+    servo["torque_gain"] = 1.0 + simulation.torque_constant_error
+    servo["drive_cycle"] = simulation.drive_cycle_s / (1.0 + 1e-6 * simulation.clock_ppm)
+    servo["until_tick"] = simulation.clock_phase * servo["drive_cycle"]
     servo["counts_per_rad"] = counts_per_rev / (2.0 * math.pi)
     servo["y"] = servo["hand_y"] = simulation.hand.rest_rad
     servo["touching"] = True
+    _latch(servo)
     return servo
 
 
 @compiled
-def encoder_counts(servos: NDArray[np.void]) -> int:
-    """Return the encoder position [increments], the nearest one."""
+def _latch(servos: NDArray[np.void]) -> None:
+    """Latch what a TPDO carries: the nearest increment of the encoder, and the torque."""
     servo: Record = servos[0]
-    return math.floor(servo.y * servo.counts_per_rad + 0.5)
+    servo.latched_counts = math.floor(servo.y * servo.counts_per_rad + 0.5)
+    servo.latched_torque = servo.torque
+
+
+@compiled
+def shows_its_torque(servos: NDArray[np.void]) -> bool:
+    """Return True if the drive shows the torque that it delivers, not the one that it applies."""
+    servo: Record = servos[0]
+    return servo.lag_rate > 0.0 or servo.drive_cycle > 0.0
 
 
 @compiled
@@ -96,33 +117,65 @@ def move_servo(
 ) -> int:
     """Move on under a torque that is demanded meanwhile, and a hand that pushes push + slope·t.
 
-    servos has dtype SERVO and shape (1,). Returns the encoder position at the end [increments].
-    The hand's push is the part of its force that does not depend on the handle's position. The
-    current loop quantizes the torque and follows as a first-order lag.
+    servos has dtype SERVO and shape (1,). Returns the encoder position that the drive knows at the
+    end [increments]. The hand's push is the part of its force that does not depend on the handle's
+    position. The current loop quantizes the torque and follows as a first-order lag.
+
+    A drive with a cycle of its own puts a demand into force at its next tick, and knows its encoder
+    as of its last one.
     """
     servo: Record = servos[0]
     demand = torque
     if servo.torque_step > 0.0:
         demand = np.rint(torque / servo.torque_step) * servo.torque_step
+    if servo.drive_cycle == 0.0:
+        servo.demand = demand
+        _move_on(servos, push, slope, duration)
+        _latch(servos)
+        return servo.latched_counts
+    tick = servo.until_tick
+    if tick > duration:
+        _move_on(servos, push, slope, duration)
+        servo.until_tick = tick - duration
+        return servo.latched_counts
+    # Between the first and the last tick nothing changes.
+    last = tick + math.floor((duration - tick) / servo.drive_cycle) * servo.drive_cycle
+    done = 0.0
+    if demand != servo.demand:
+        _move_on(servos, push, slope, tick)
+        servo.demand = demand
+        done = tick
+    _move_on(servos, push + slope * done, slope, last - done)
+    _latch(servos)
+    _move_on(servos, push + slope * last, slope, duration - last)
+    servo.until_tick = last + servo.drive_cycle - duration
+    return servo.latched_counts
+
+
+@compiled
+def _move_on(servos: NDArray[np.void], push: float, slope: float, duration: float) -> None:
+    """Move on under the torque that is in force, from one tick of the drive to another."""
+    servo: Record = servos[0]
     rate = servo.lag_rate
-    start = servo.torque if rate > 0.0 else demand
-    excess = start - demand
+    start = servo.torque if rate > 0.0 else servo.demand
+    excess = start - servo.demand
+    motor = Force(servo.torque_gain * start, 0.0, servo.torque_gain * excess, rate)
     if servo.grip:
         joined = servo.joined[0]
+        pull = motor.constant + push
         if excess == 0.0:
-            servo.y, servo.v, _ = advance(joined, servo.y, servo.v, start + push, slope, duration)
+            servo.y, servo.v, _ = advance(joined, servo.y, servo.v, pull, slope, duration)
         else:
             servo.y, servo.v, _ = advance(
-                joined, servo.y, servo.v, start + push, slope, duration, excess, rate
+                joined, servo.y, servo.v, pull, slope, duration, motor.excess, rate
             )
         servo.hand_y, servo.hand_v = servo.y, servo.v
     else:
         hand = HandBody(servo.hand_mass, servo.hand_viscous, servo.hand_spring, servo.hand_side)
         now = Grasp(servo.y, servo.v, servo.hand_y, servo.hand_v, servo.touching)
-        motor, script = Force(start, 0.0, excess, rate), Force(push, slope, 0.0, 0.0)
+        script = Force(push, slope, 0.0, 0.0)
         now = advance_grasp(servo.handle[0], servo.joined[0], hand, now, motor, script, duration)
         servo.y, servo.v, servo.hand_y, servo.hand_v, servo.touching = now
-    servo.torque = demand
+    servo.torque = servo.demand
     if excess != 0.0:
         servo.torque += excess * math.exp(-rate * duration)
-    return encoder_counts(servos)

@@ -44,7 +44,7 @@ class Motion(Protocol):
     """Motor, encoder and hand, as the drive sees them."""
 
     def counts(self) -> int:
-        """Return the encoder position in increments; the drive shows its low 32 bits."""
+        """Return the encoder position that is known, in increments; the bus has its low 32 bits."""
         ...
 
     def speed_counts_per_s(self) -> float:
@@ -52,7 +52,7 @@ class Motion(Protocol):
         ...
 
     def torque_nm(self) -> float | None:
-        """Return the torque that the current loop delivers now; None if it follows at once."""
+        """Return the torque that the drive believes to deliver; None if it follows at once."""
         ...
 
     def advance(self, torque_nm: float, duration_s: float) -> None:

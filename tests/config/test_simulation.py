@@ -1,0 +1,33 @@
+"""`[simulation]`: keys that depend on each other, and what an ideal drive is."""
+
+import pytest
+from pydantic import ValidationError
+
+from canwall.config import Simulation
+from canwall.simdrive import make_servo
+
+REAL = {
+    "coulomb_nm": 0.02,
+    "stiction_nm": 0.05,
+    "current_bandwidth_hz": 1600.0,
+    "torque_constant_error": 0.1,
+    "drive_cycle_s": 0.00025,
+}
+
+
+def test_ideal_is_one_thing_by_key_and_by_method() -> None:
+    by_key = Simulation.model_validate(REAL | {"ideal": True})
+    assert by_key == Simulation.model_validate(REAL).with_ideal_servo()
+    (servo,) = make_servo(by_key, 131072.0)
+    for name in ("lag_rate", "torque_step", "drive_cycle"):
+        assert servo[name] == 0.0
+    assert servo["torque_gain"] == 1.0
+    assert servo["handle"]["cogging"] == 0.0
+    assert servo["handle"]["stiction"] == servo["handle"]["coulomb"] == 0.02
+    assert Simulation.model_validate(by_key.model_dump()) == by_key
+
+
+def test_stiction_is_that_of_coulomb_where_it_is_not_given() -> None:
+    assert Simulation(coulomb_nm=0.02).breakaway_nm == 0.02
+    with pytest.raises(ValidationError, match=r"stiction_nm: has to be at least coulomb_nm, 0.02"):
+        Simulation(coulomb_nm=0.02, stiction_nm=0.01)
