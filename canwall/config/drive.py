@@ -43,7 +43,8 @@ class Drive(Section):
     first. restore: undo all changes at the end. watchdog_s: silence of the master after which the
     drive disables itself. wait_s: how long to wait for the drive to answer. sdo_timeout_s: how
     long to wait for the answer to one SDO request. rated_torque_unit_nm: unit of 0x6076 in N·m;
-    CiA 402 has 1e-3, some manufacturers 1e-6.
+    CiA 402 has 1e-3, some manufacturers 1e-6. drive_cycle_s, current_bandwidth_hz: the drive's own
+    cycle, and the bandwidth of its current loop, as the model of the laws has them; 0: not known.
     """
 
     node_id: int = Field(ge=1, le=127)
@@ -54,6 +55,8 @@ class Drive(Section):
     rated_torque_unit_nm: Annotated[Positive, Field(ge=1e-9, le=1.0)] | None = None
     counts_per_rev: Positive | None = None
     gear_ratio: Positive | None = None
+    drive_cycle_s: NonNegative = 0.0
+    current_bandwidth_hz: NonNegative = 0.0
     parameters: Objects = Field(default_factory=dict)
     download_dcf: bool = False
     restore: bool = False

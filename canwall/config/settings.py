@@ -44,13 +44,20 @@ class Mechanics(Section):
 
 
 class Wall(Section):
-    """`[wall]`: position, stiffness and damping, and the law that renders it."""
+    """`[wall]`: position, stiffness and damping, and the law that renders it.
+
+    Attributes:
+        damping_ratio: ζ of B = 2·ζ·√(K·m) with the mass in force, in place of a given damping.
+        cap: c of the largest stiffness in force, c·m/T² with the mass in force.
+    """
 
     law: str = "half_sample"
     position_rad: Number = 0.0
     side: Literal["below", "above"] = "below"
     stiffness_nm_per_rad: NonNegative = 50.0
     damping_nm_s_per_rad: NonNegative = 0.0
+    damping_ratio: Positive | None = None
+    cap: Positive | None = None
     deadbeat: bool = False
     velocity: Literal["difference", "estimated"] = "difference"
     options: dict[str, Number] = Field(default_factory=dict)
@@ -64,7 +71,8 @@ class Estimator(Section):
     """`[estimator]`: the Kalman filter.
 
     Attributes:
-        force_walk_nm_per_sqrt_s: Random walk of the operator's force.
+        force_walk_nm_per_sqrt_s: Random walk of the operator's force. Default: 0.2; with
+            operator.adapt 0.01.
         delay_cycles: Delay D from the sampling of a position until the torque computed from it
             takes effect, in cycles. Default: 1 with synchronous PDOs; measured with others.
         measure_delay: Always measure the delay before the wall is rendered.
@@ -72,11 +80,30 @@ class Estimator(Section):
         measure_cycles: Duration of the measurement.
     """
 
-    force_walk_nm_per_sqrt_s: Annotated[Positive, Field(ge=1e-4, le=100.0)] = 0.2
+    force_walk_nm_per_sqrt_s: Annotated[Positive, Field(ge=1e-4, le=100.0)] | None = None
     delay_cycles: Annotated[Number, Field(ge=0, le=3)] | None = None
     measure_delay: bool = False
     measure_torque_nm: Positive = 0.15
     measure_cycles: int = Field(400, ge=100, le=10_000)
+
+
+class Operator(Section):
+    """`[operator]`: the hand at the handle, identified in the cycle from the wall's own torques.
+
+    Attributes:
+        adapt: Identify it. [mechanics] is then the drive with its handle, without a hand.
+        lightest_kg_m2: Inertia of drive, handle and hand to begin with. Default: that of
+            [mechanics].
+        heaviest_kg_m2: Largest inertia of drive, handle and hand.
+        damping_nm_s_per_rad: Damping of a heavy hand; a light one has less.
+        filters: Number of hands, in geometric progression, that are compared in each cycle.
+    """
+
+    adapt: bool = False
+    lightest_kg_m2: Positive | None = None
+    heaviest_kg_m2: Positive = 4.5e-3
+    damping_nm_s_per_rad: NonNegative = 0.04
+    filters: int = Field(16, ge=3, le=24)
 
 
 class Limits(Section):
@@ -178,6 +205,7 @@ class Settings(Section):
     mechanics: Mechanics
     wall: Wall = Wall()
     estimator: Estimator = Estimator()
+    operator: Operator = Operator()
     limits: Limits
     run: Run = Run()
     simulation: Simulation | None = None
@@ -225,6 +253,14 @@ class Settings(Section):
         """
         others = [wall.model_copy(update={"law": law, "options": {}}) for law in wall.alternate]
         return [wall, *others]
+
+    @property
+    def force_walk(self) -> float:
+        """Random walk of the operator's force in the model of the laws [N·m/√s]."""
+        given = self.estimator.force_walk_nm_per_sqrt_s
+        if given is not None:
+            return given
+        return 0.01 if self.operator.adapt else 0.2
 
     @property
     def embedded(self) -> bool:

@@ -14,13 +14,17 @@ from canwall.config import Limits, Settings, Wall
 from canwall.drive import DriveSetup, PdoLayout
 from canwall.drive import objects as od
 from canwall.walls import (
+    BANK,
     ESTIMATOR,
     TENSION,
     WALL,
     Law,
     clear_memory,
     find_law,
+    hand_damping,
+    reset_bank,
     reset_estimator,
+    set_bank,
     set_estimator,
     set_plant,
     set_referent,
@@ -104,7 +108,8 @@ CYCLE = np.dtype(
         ("blind", RENDERED, (1,)),
         ("is_blind", "?"),
         ("estimator", ESTIMATOR, (1,)),
-        # The same for TPDOs that have been a cycle late since one was missing: while it is being
+        ("bank", BANK, (1,)),
+        # The estimator for TPDOs that are a cycle late since one was missing: while it is being
         # compared, how much likelier it has been; the number of cycles that was found.
         ("lagging", ESTIMATOR, (1,)),
         ("compares_lag", "?"),
@@ -179,9 +184,13 @@ def make_cycle(settings: Settings, setup: DriveSetup, laws: Sequence[Law]) -> ND
     for i, law in enumerate(laws):
         cycle["laws"][0, i] = law.address
     delay = settings.estimator.delay_cycles
-    set_delay(cycle, settings, SYNCHRONOUS_DELAY if delay is None else delay)
+    set_delay(cycle, settings, modelled_delay(settings) if delay is None else delay)
     set_limits(cycle, settings.limits)
-    set_plant(cycle["rendered"][0]["wall"][0], *_model(settings), period)
+    mass, viscous, spring = _model(settings)
+    if settings.operator.adapt:
+        masses, dampings = _hands(settings)
+        mass, viscous = masses[0], dampings[0]
+    set_plant(cycle["rendered"][0]["wall"][0], mass, viscous, spring, period)
     cycle["rendered"]["law"] = NO_LAW
     set_wall(cycle, settings.wall, laws)
     return cycle
@@ -193,16 +202,47 @@ def _model(settings: Settings) -> tuple[float, float, float]:
     return mechanics.inertia_kg_m2, mechanics.viscous_nm_s_per_rad, mechanics.spring_nm_per_rad
 
 
+def modelled_delay(settings: Settings) -> float:
+    """Return D of a synchronous RPDO, with the drive's own cycle and current loop [periods]."""
+    drive = settings.drive
+    lag_s = 0.0
+    if drive.current_bandwidth_hz:
+        lag_s = 1.0 / (2.0 * math.pi * drive.current_bandwidth_hz)
+    return SYNCHRONOUS_DELAY + (drive.drive_cycle_s + lag_s) / settings.bus.cycle_s
+
+
+def _hands(settings: Settings) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return masses and viscous dampings of the bank: the drive with lighter and heavier hands."""
+    operator, mechanics = settings.operator, settings.mechanics
+    lightest = operator.lightest_kg_m2 or mechanics.inertia_kg_m2
+    masses = np.geomspace(lightest, operator.heaviest_kg_m2, operator.filters)
+    hands = [
+        hand_damping(max(mass - mechanics.inertia_kg_m2, 0.0), operator.damping_nm_s_per_rad)
+        for mass in masses.tolist()
+    ]
+    return masses, mechanics.viscous_nm_s_per_rad + np.array(hands)
+
+
 def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None:
     """Reset the estimator for a delay of `delay` periods. Raises ValueError."""
+    mass, viscous, spring = _model(settings)
+    coulomb, period = settings.mechanics.coulomb_nm, settings.bus.cycle_s
+    count, force_walk = float(cycle["rad_per_count"][0]), settings.force_walk
+    if settings.operator.adapt:
+        masses, dampings = _hands(settings)
+        bank = cycle["bank"][0]
+        set_bank(bank, masses, dampings, spring, period, count, force_walk, delay)
+        mass, viscous, coulomb = masses[0], dampings[0], 0.0
     set_estimator(
         cycle["estimator"][0],
-        *_model(settings),
-        settings.mechanics.coulomb_nm,
-        settings.bus.cycle_s,
-        count=float(cycle["rad_per_count"][0]),
-        force_walk=settings.estimator.force_walk_nm_per_sqrt_s,
-        delay=delay,
+        mass,
+        viscous,
+        spring,
+        coulomb,
+        period,
+        count,
+        force_walk,
+        delay,
     )
     _reset(cycle, float(cycle["oriented"][0]))
 
@@ -210,6 +250,7 @@ def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None
 def _reset(cycle: NDArray[np.void], oriented: float) -> None:
     """Reset the estimator at a position [rad]; TPDOs are what its delay takes them for."""
     reset_estimator(cycle["estimator"][0], oriented)
+    reset_bank(cycle["bank"][0], oriented)
     cycle["compares_lag"] = False
     cycle["lag"] = 0
 
@@ -260,6 +301,7 @@ def set_wall(cycle: NDArray[np.void], wall: Wall, laws: Sequence[Law]) -> None:
         mass, viscous, spring = (known[name].item() for name in ("mass", "viscous", "spring"))
         set_plant(known, mass, viscous, spring, cycle["period"].item() * wall.divider)
     set_referent(known, wall.stiffness_nm_per_rad, wall.damping_nm_s_per_rad, options)
+    known["damping_ratio"], known["cap"] = wall.damping_ratio or 0.0, wall.cap or 0.0
     known["tension"] = TENSION[wall.tension]
     known["passivity_damping"] = wall.passivity_nm_s_per_rad
     if index != rendered["law"]:

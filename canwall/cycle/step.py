@@ -16,12 +16,16 @@ from canwall.units import to_per_mille
 from canwall.walls import (
     acting_force,
     actuation_state,
+    change_plant,
     correct,
+    correct_bank,
     end_lag,
     may_lag,
     note_missing_sample,
     predict,
+    predict_bank,
     predict_open_loop,
+    put_in_force,
     set_applied_force,
     stand_still,
     start_lagging,
@@ -104,6 +108,17 @@ def _set_wall_inputs(cycle: Record, rendered: Record, sample: float, due: bool) 
     y, wall.v = actuation_state(estimator)
     wall.y = y - origin
     wall.d = estimator.d - wall.spring * origin
+    put_in_force(wall)
+
+
+@compiled
+def _identify_operator(cycle: Record) -> None:
+    """Let the bank learn from the sample; the walls' laws get the mass that it finds."""
+    bank, estimator = cycle.bank[0], cycle.estimator[0]
+    if correct_bank(bank, estimator, cycle.oriented):
+        change_plant(cycle.rendered[0].wall[0], estimator.mass, estimator.viscous)
+        if cycle.fade_left > 0:
+            change_plant(cycle.faded[0].wall[0], estimator.mass, estimator.viscous)
 
 
 @compiled
@@ -336,6 +351,8 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
         if cycle.compares_lag:
             _compare_lag(cycle)
         correct(estimator, cycle.oriented)
+        if cycle.bank[0].adapts:
+            _identify_operator(cycle)
     else:
         begins_lag = _may_begin_to_lag(cycle)
         note_missing_sample(estimator)
@@ -351,6 +368,8 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     sent = cycle.orientation * torque
     if cycle.frozen and cycle.frozen < cycle.stuck_cycles:
         predict_open_loop(estimator, sent)
+    if cycle.bank[0].adapts:
+        predict_bank(cycle.bank[0], estimator, sent)
     predict(estimator, sent)
     if begins_lag:
         start_lagging(cycle.lagging[0], sent)
@@ -381,8 +400,11 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     row.torque_actual = cycle.torque_actual * cycle.nm_per_mille
     row.force_applied = cycle.force_applied
     row.law = rendered.law
-    row.stiffness = wall.stiffness
+    row.stiffness = wall.asked_stiffness
     row.damping = wall.damping
+    row.stiffness_in_force = wall.stiffness
+    row.mass_est = estimator.mass
+    row.mass_spread = cycle.bank[0].spread
     row.wall_position_rad = rendered.position
     cycle.j += 1
     return _placed(cycle.controlword, cycle.out_controlword[0]) | _placed(

@@ -294,8 +294,8 @@ def simulate_wall(
     cycle: Record = loop.cycle[0]
     # The fields that `set_wall` sets.
     wall = cycle.rendered[0].wall[0]
-    wall.stiffness = stiffness
-    wall.damping = damping
+    wall.stiffness = wall.asked_stiffness = stiffness
+    wall.damping = wall.asked_damping = damping
     wall.referent[0].wall_stiffness = stiffness
     wall.referent[0].wall_damping = damping
     return _run_cycles(loop, rows, signals)

@@ -4,6 +4,15 @@ A law is a function of the record of one wall (`WALL`) that returns the force pu
 out of it. Nothing here knows of CAN, counts or drives.
 """
 
+from canwall.walls.bank import (
+    BANK,
+    MAX_FILTERS,
+    correct_bank,
+    hand_damping,
+    predict_bank,
+    reset_bank,
+    set_bank,
+)
 from canwall.walls.estimator import (
     ESTIMATOR,
     MAX_DELAY,
@@ -29,8 +38,10 @@ from canwall.walls.interface import (
     Law,
     UnknownLawError,
     call_law,
+    change_plant,
     clear_memory,
     law,
+    put_in_force,
     set_plant,
     set_referent,
 )
@@ -38,11 +49,13 @@ from canwall.walls.layers import TENSION, set_applied_force, wall_force
 from canwall.walls.registry import LAWS, find_law
 
 __all__ = [
+    "BANK",
     "DEADBEAT",
     "ESTIMATOR",
     "HORIZON",
     "LAWS",
     "MAX_DELAY",
+    "MAX_FILTERS",
     "TENSION",
     "WALL",
     "Law",
@@ -50,17 +63,24 @@ __all__ = [
     "acting_force",
     "actuation_state",
     "call_law",
+    "change_plant",
     "clear_memory",
     "correct",
+    "correct_bank",
     "end_lag",
     "find_law",
+    "hand_damping",
     "law",
     "may_lag",
     "note_missing_sample",
     "predict",
+    "predict_bank",
     "predict_open_loop",
+    "put_in_force",
+    "reset_bank",
     "reset_estimator",
     "set_applied_force",
+    "set_bank",
     "set_estimator",
     "set_plant",
     "set_referent",

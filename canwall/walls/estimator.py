@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
-from canwall.physics import zoh
+from canwall.physics import zoh, zoh_coefficients
 
 #: Largest delay, in whole periods, between a sample and the force computed from it.
 MAX_DELAY = 3
@@ -51,6 +51,7 @@ ESTIMATOR = np.dtype(
         ("force_noise", "f8"),
         ("scale", "f8", (3,)),
         ("mass", "f8"),
+        ("viscous", "f8"),
         ("coulomb", "f8"),
         ("delay_periods", "i8"),
         ("full", _HOLD, (1,)),
@@ -134,7 +135,7 @@ def set_estimator(
     whole = math.floor(delay)
     fraction = delay - whole
     estimator["delay_periods"] = whole
-    estimator["mass"] = mass
+    estimator["mass"], estimator["viscous"] = mass, viscous
     estimator["coulomb"] = coulomb
     kalman = kalman_model(mass, viscous, spring, period, count, force_walk)
     estimator["transition"], estimator["force_noise"] = kalman.transition, kalman.force_noise
@@ -154,6 +155,22 @@ def reset_estimator(estimator: NDArray[np.void], y: float) -> None:
     estimator["y"] = estimator["sampled"] = y
     estimator["v"] = estimator["d"] = 0.0
     estimator["in_flight"] = 0.0
+
+
+@compiled
+def set_model(estimator: Record, mass: float, viscous: float, spring: float) -> None:
+    """Exchange the model of the motion; gain and covariance stay."""
+    estimator.mass, estimator.viscous = mass, viscous
+    _set_hold(estimator.full[0], mass, viscous, spring)
+    _set_hold(estimator.before[0], mass, viscous, spring)
+    _set_hold(estimator.after[0], mass, viscous, spring)
+
+
+@compiled
+def _set_hold(hold: Record, mass: float, viscous: float, spring: float) -> None:
+    p11, p12, p21, p22, c1, c2 = zoh_coefficients(mass, viscous, spring, hold.duration)
+    hold.phi[0, 0], hold.phi[0, 1], hold.phi[1, 0], hold.phi[1, 1] = p11, p12, p21, p22
+    hold.gamma[0], hold.gamma[1] = c1, c2
 
 
 @compiled

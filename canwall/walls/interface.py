@@ -4,6 +4,7 @@ One sign everywhere: y < 0 is inside the wall, a force f > 0 pushes the operator
 the record and returns f; it does not clamp to the drive's limits and does not round.
 """
 
+import math
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled, compiled_for_c
 from canwall.errors import InputError
-from canwall.physics import PLANT, zoh
+from canwall.physics import PLANT, zoh, zoh_coefficients
 
 #: Numbers that the record has room for: options of a law, and its memory.
 MAX_OPTIONS = 64
@@ -28,9 +29,14 @@ HORIZON = 64
 #: the same record with names to its options (`wall_with`): `wall.options.growth`.
 WALL = np.dtype(
     [
-        # The wall to be rendered.
+        # The wall in force, and the one asked for: K_e = min(K, cap·m/T²) where there is a cap, and
+        # B = 2·ζ·√(K_e·m) where there is a damping ratio; zero: none.
         ("stiffness", "f8"),
         ("damping", "f8"),
+        ("asked_stiffness", "f8"),
+        ("asked_damping", "f8"),
+        ("damping_ratio", "f8"),
+        ("cap", "f8"),
         # The plant: m·ÿ + b·ẏ + k_h·y = f + d, with its equivalent for forces held over T.
         ("mass", "f8"),
         ("viscous", "f8"),
@@ -203,8 +209,8 @@ def set_referent(
 
     `options` are the law's, as from `Law.option_values`.
     """
-    wall["stiffness"] = stiffness
-    wall["damping"] = damping
+    wall["stiffness"] = wall["asked_stiffness"] = stiffness
+    wall["damping"] = wall["asked_damping"] = damping
     wall["referent"]["wall_stiffness"] = stiffness
     wall["referent"]["wall_damping"] = damping
     wall["option_values"] = 0.0
@@ -215,6 +221,35 @@ def clear_memory(wall: NDArray[np.void]) -> None:
     """Clear the memory of law and layers, for another law to take over."""
     for name in ("memory", "plan", "absorbed", "force_before"):
         wall[name] = 0.0
+
+
+#: Growth in a period of a stiffness that the mass in force allows again: inside the wall, where
+#: the spring is loaded, and outside.
+_GROWTH_INSIDE, _GROWTH_OUTSIDE = 1.01, 1.2
+
+
+@compiled
+def put_in_force(wall: Record) -> None:
+    """Set stiffness and damping in force from those asked for, for the mass of the plant."""
+    stiffness = wall.asked_stiffness
+    if wall.cap > 0.0:
+        growth = _GROWTH_INSIDE if wall.y_sample < 0.0 else _GROWTH_OUTSIDE
+        allowed = min(stiffness, wall.cap * wall.mass / (wall.period * wall.period))
+        stiffness = min(allowed, growth * wall.stiffness)
+    wall.stiffness = stiffness
+    wall.damping = wall.asked_damping
+    if wall.damping_ratio > 0.0:
+        wall.damping = 2.0 * wall.damping_ratio * math.sqrt(stiffness * wall.mass)
+
+
+@compiled
+def change_plant(wall: Record, mass: float, viscous: float) -> None:
+    """Exchange mass and viscous damping of the plant, and with them its hold equivalent."""
+    wall.mass = wall.referent[0].mass = mass
+    wall.viscous = wall.referent[0].viscous = viscous
+    p11, p12, p21, p22, c1, c2 = zoh_coefficients(mass, viscous, wall.spring, wall.period)
+    wall.phi[0, 0], wall.phi[0, 1], wall.phi[1, 0], wall.phi[1, 1] = p11, p12, p21, p22
+    wall.gamma[0], wall.gamma[1] = c1, c2
 
 
 @compiled
