@@ -1,8 +1,11 @@
-"""K-limit: the largest stiffness free of chatter (theory, section 5), by bisection in log K."""
+"""K-limit: the stiffness up to which every wall is free of chatter (theory, section 5).
 
-import functools
+Chatter is not monotone in K: a search by bisection jumps over islands of it. So walls are scanned
+upwards, each strike up to its first wall that chatters.
+"""
+
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -10,10 +13,11 @@ from numpy.typing import NDArray
 
 from canwall.analysis.strike import MEASURES
 
-#: Start and bounds of the search, as K·T²/m.
-FIRST, SMALLEST, LARGEST = 1.0 / 512.0, 1e-5, 4.0
-#: Width of the final bracket in log K.
-RESOLUTION = 0.01
+#: Factor from one wall to the next, and that of the steps before the first that chatters.
+FACTOR, FINE_STEPS = 1.25, 5
+FINE_FACTOR = FACTOR ** (1.0 / FINE_STEPS)
+#: Walls of the scan, as K·T²/m: 1e-4 to 4.5.
+SCANNED = 1e-4 * FACTOR ** np.arange(49)
 
 #: One strike of a search: its own K-limit [N·m/rad]; whether that is only the end of the search;
 #: the worst K-limit of all strikes [N·m/rad]; MEASURES of the strike at the worst (NaN if it is 0).
@@ -35,16 +39,21 @@ class RepeatableStrike(Protocol):
         """Sampling period T [s]."""
         ...
 
+    @property
+    def softest(self) -> float:
+        """Stiffness below which a wall does not hold the hand within the limits [N·m/rad]."""
+        ...
+
     def on(self, stiffness: float, damping: float) -> np.void:
         """Strike a wall of this stiffness [N·m/rad] and damping [N·m·s/rad]; dtype MEASURES."""
         ...
 
 
 def k_limits(strikes: Sequence[RepeatableStrike], damping: float) -> NDArray[np.void]:
-    """Search the K-limit of each strike, and a stiffness at which none of them chatters.
+    """Search the K-limit of each strike, and a stiffness up to which none of them chatters.
 
-    The worst K-limit may be below the smallest limit of a single strike: a strike that is free of
-    chatter at its own limit may chatter below it.
+    The worst K-limit may be below the smallest limit of a single strike: each is found on steps of
+    its own.
 
     Args:
         strikes: Strikes with the same mass and period.
@@ -56,8 +65,7 @@ def k_limits(strikes: Sequence[RepeatableStrike], damping: float) -> NDArray[np.
     limits = np.zeros(len(strikes), K_LIMIT)
     unit = strikes[0].mass / strikes[0].period ** 2
     for i, strike in enumerate(strikes):
-        free, chatters = bracket(functools.partial(_is_free, strike, unit, damping))
-        limits["limit"][i], limits["open_ended"][i] = free * unit, math.isinf(chatters)
+        limits["limit"][i], limits["open_ended"][i] = scan(strike, unit, damping)
     worst = limits["limit"].min()
     while worst > 0.0:
         measures = [strike.on(worst, damping) for strike in strikes]
@@ -65,8 +73,8 @@ def k_limits(strikes: Sequence[RepeatableStrike], damping: float) -> NDArray[np.
             for name in MEASURES.names or ():
                 limits[name] = [m[name] for m in measures]
             break
-        worst *= math.exp(-RESOLUTION)
-        if worst < SMALLEST * unit:
+        worst /= FINE_FACTOR
+        if worst < SCANNED[0] * unit:
             worst = 0.0
     if worst == 0.0:
         for name in MEASURES.names or ():
@@ -75,43 +83,34 @@ def k_limits(strikes: Sequence[RepeatableStrike], damping: float) -> NDArray[np.
     return limits
 
 
-def _is_free(strike: RepeatableStrike, unit: float, damping: float, normalised: float) -> bool:
-    return not strike.on(normalised * unit, damping)["chatters"]
+def scan(strike: RepeatableStrike, unit: float, damping: float) -> tuple[float, bool]:
+    """Scan walls upwards until one chatters: by FACTOR, and anew in finer steps before that one.
 
+    Walls too soft to hold the hand are passed over where they trip.
 
-def bracket(is_free: Callable[[float], bool]) -> tuple[float, float]:
-    """Bracket the largest K·T²/m that is free of chatter to RESOLUTION in its logarithm.
-
-    Doubles from FIRST until a value chatters. If FIRST itself chatters, halves until a value is
-    free; if none is (a very soft wall may fail to hold the hand), doubles until one is.
+    Args:
+        strike: The strike.
+        unit: Stiffness of K·T²/m = 1 [N·m/rad].
+        damping: Damping of the walls [N·m·s/rad].
 
     Returns:
-        The largest free value, 0 if there is none, and the next that chatters, infinity if all do
-        not up to LARGEST.
+        The stiffness up to which every wall of the scan is free of chatter [N·m/rad], 0 if the
+        first chatters; True if that is the end of the scan.
     """
-    doublings = math.floor(math.log2(LARGEST / FIRST))
-    halvings = math.floor(math.log2(FIRST / SMALLEST))
-    up = [FIRST * 2.0**n for n in range(doublings + 1)]
-    down = [FIRST * 0.5**n for n in range(1, halvings + 1)]
-    free, chatters = 0.0, math.inf
-    if not is_free(up[0]):
-        chatters = up.pop(0)
-        for value in down:
-            if is_free(value):
-                free = value
-                break
-            chatters = value
-    if free == 0.0:
-        for value in up:
-            if is_free(value):
-                free, chatters = value, math.inf
-            elif free > 0.0:
-                chatters = value
-                break
-    while free > 0.0 and math.isfinite(chatters) and math.log(chatters / free) >= RESOLUTION:
-        middle = math.sqrt(free * chatters)
-        if is_free(middle):
-            free = middle
-        else:
-            chatters = middle
-    return free, chatters
+    free = 0.0
+    for normalised in SCANNED:
+        stiffness = normalised * unit
+        measures = strike.on(stiffness, damping)
+        if stiffness < strike.softest and measures["trip"]:
+            continue
+        if measures["chatters"]:
+            break
+        free = stiffness
+    else:
+        return free, free > 0.0
+    for _ in range(FINE_STEPS - 1):
+        finer = free * FINE_FACTOR
+        if free == 0.0 or strike.on(finer, damping)["chatters"]:
+            break
+        free = finer
+    return free, False

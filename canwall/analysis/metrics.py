@@ -1,14 +1,19 @@
 """Metrics of a wall (theory, section 5): energy, contacts, strikes and chatter.
 
+What is felt of a wall at rest is in `felt`.
+
 Positions y are relative to the wall at each SYNC, y < 0 inside. Forces f are held from each SYNC
 to the next, positive out of the wall. Units: rad and N·m, or m and N.
 """
 
+import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from canwall.analysis.felt import FELT_BAND_HZ, QUIET_N
 from canwall.compiled import compiled
 
 Array = NDArray[np.float64]
@@ -19,6 +24,8 @@ STRIKE_GAP_S = 0.2
 EVENT_WINDOW_S = 0.2
 #: Makes and breaks in a window, beyond the referent's, from which on a wall chatters.
 EVENTS_OF_CHATTER = 3
+#: Makes and breaks over the referent's, up to which they are no chatter where no energy came out.
+EVENTS_RATIO = 1.25
 #: Shortest stretch over which a settled position is judged [s].
 SETTLED_S = 0.05
 
@@ -90,10 +97,32 @@ def strikes(
 
 @dataclass(frozen=True)
 class Chatter:
-    """Verdict on a strike: whether the wall chattered, and the reason in words."""
+    """Verdict on a strike.
+
+    Attributes:
+        chatters: True if the wall chattered.
+        reason: The reason in words.
+        by: The criterion that found chatter, the first of several; empty without chatter.
+    """
 
     chatters: bool
     reason: str
+    by: Literal["", "counts", "amplitude", "ripple"] = ""
+
+
+@dataclass(frozen=True)
+class Ripple:
+    """Felt ripple of a strike [N], r.m.s. at the handle; NaN where nothing settles.
+
+    Attributes:
+        measured: That of the wall.
+        referent: That of the continuous referent.
+        source: Origin of the force, for the words of the verdict.
+    """
+
+    measured: float = math.nan
+    referent: float = 0.0
+    source: str = ""
 
 
 @compiled
@@ -103,13 +132,20 @@ def amplitude_tolerance(stiffness: float, count: float, force_step: float) -> fl
 
 
 def chatter(
-    y: Array, referent: Array | None, cycle_s: float, tolerance: float, count: float
+    y: Array,
+    referent: Array | None,
+    cycle_s: float,
+    tolerance: float,
+    count: float,
+    gives_energy: bool = True,
+    ripple: Ripple | None = None,
 ) -> Chatter:
     """Judge whether a wall chattered in one strike.
 
-    Chatter is motion about the settled contact that exceeds the referent's by more than
-    `tolerance`, or EVENTS_OF_CHATTER more makes and breaks of contact within EVENT_WINDOW_S than
-    the referent has. Without a referent (a person at the handle) only the events are judged.
+    Chatter is more makes and breaks of contact than the referent has (`bounces_more`), motion
+    about the settled contact that exceeds the referent's by more than `tolerance`, or a felt ripple
+    that exceeds the referent's by more than QUIET_N. Without a referent (a person at the handle)
+    the motion is not judged.
 
     Args:
         y: Positions relative to the wall over the strike, shape (n,).
@@ -117,26 +153,55 @@ def chatter(
         cycle_s: Period of the SYNC [s].
         tolerance: `amplitude_tolerance`, in the unit of y.
         count: One encoder count, in the unit of y.
+        gives_energy: True if the wall put out energy in the strike.
+        ripple: Felt ripple, if it is known.
     """
+    ripple = Ripple() if ripple is None else ripple
     # The busiest window of each is compared, not window by window: a wall that loses some energy
     # bounces as its referent does, only earlier.
     window = event_window(cycle_s)
     events = busiest_window(y, window, count)
     expected = 0 if referent is None else busiest_window(referent, window, count)
-    if events - expected >= EVENTS_OF_CHATTER:
+    if bounces_more(events, expected, gives_energy):
         compared = "without a referent" if referent is None else f"the referent {expected}"
-        return Chatter(
-            True,
-            f"{events} makes and breaks within {EVENT_WINDOW_S * 1e3:.0f} ms, {compared}",
-        )
+        reason = f"{events} makes and breaks within {EVENT_WINDOW_S * 1e3:.0f} ms, {compared}"
+        return Chatter(True, reason, "counts")
+    felt = (
+        f"felt ripple {ripple.measured:.2g} N r.m.s. in {FELT_BAND_HZ[0]:g}–{FELT_BAND_HZ[1]:g} Hz"
+        f"{ripple.source}, quiet up to {QUIET_N:g} N"
+    )
+    ripples = is_felt(ripple.measured, ripple.referent)
     if referent is None:
+        if ripples:
+            return Chatter(True, felt, "ripple")
         return Chatter(False, "too few makes and breaks; amplitude not judged without a referent")
-    start, stop = settled_window(referent, tolerance, cycle_s)
+    _, start, stop = settled_window(referent, tolerance, cycle_s)
     if start == stop:
         return Chatter(False, "the referent never settles; amplitude not judged")
     measured, own = peak_to_peak(y[start:stop]), peak_to_peak(referent[start:stop])
     compared = f"{measured:.3g} peak to peak about the settled contact, referent {own:.3g}"
-    return Chatter(measured - own > tolerance, f"{compared}, quantisation explains {tolerance:.3g}")
+    reason = f"{compared}, quantisation explains {tolerance:.3g}"
+    if measured - own > tolerance:
+        return Chatter(True, reason, "amplitude")
+    return Chatter(True, felt, "ripple") if ripples else Chatter(False, reason)
+
+
+@compiled
+def bounces_more(events: int, expected: int, gives_energy: bool) -> bool:
+    """Return True if makes and breaks of contact in the busiest window are chatter.
+
+    Those are EVENTS_OF_CHATTER more than the referent's. Of a wall that gave no energy they also
+    have to be EVENTS_RATIO times as many: 25 against 21 are the bounces of a passive wall.
+    """
+    if events - expected < EVENTS_OF_CHATTER:
+        return False
+    return gives_energy or events > EVENTS_RATIO * expected
+
+
+@compiled
+def is_felt(ripple: float, referent: float) -> bool:
+    """Return True if a felt ripple exceeds the referent's by more than QUIET_N [N]."""
+    return ripple - referent > QUIET_N
 
 
 @compiled
@@ -192,17 +257,24 @@ def settled_stretch(referent: Array, tolerance: float) -> tuple[int, int]:
 
 
 @compiled
-def settled_window(referent: Array, tolerance: float, cycle_s: float) -> tuple[int, int]:
-    """Return the window in which the motion about a settled contact is judged.
+def settled_window(referent: Array, tolerance: float, cycle_s: float) -> tuple[int, int, int]:
+    """Return the settled stretch and the window in it in which motion and force are judged.
 
-    It is the middle of the settled stretch: the wall may come to rest later than the referent and
-    leave its rest earlier. As its first cycle and the one after its last; (0, 0) if the referent
-    settles for less than SETTLED_S.
+    The window is `judged_part`: the wall may come to rest later than the referent and leave its
+    rest earlier. As the first cycle of the stretch, the first of the window and the one after its
+    last; (0, 0, 0) if the referent settles for less than SETTLED_S.
     """
     start, stop = settled_stretch(referent, tolerance)
+    if (stop - start) * cycle_s < SETTLED_S:
+        return 0, 0, 0
+    first, last = judged_part(start, stop)
+    return start, first, last
+
+
+@compiled
+def judged_part(start: int, stop: int) -> tuple[int, int]:
+    """Return the part of a stretch in which the wall is at rest: its second half but the end."""
     length = stop - start
-    if length * cycle_s < SETTLED_S:
-        return 0, 0
     return start + length // 2, start + length * 9 // 10
 
 

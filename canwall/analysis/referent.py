@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from canwall.analysis.felt import mean_force
 from canwall.compiled import Record, compiled
 from canwall.physics import Force, Grasp, HandBody, advance, advance_grasp
 
@@ -20,6 +21,7 @@ class ReferentInputs(NamedTuple):
         handle: Plant of the handle alone, shape (1,), dtype PLANT.
         joined: Plant of handle and hand moving as one, shape (1,), dtype PLANT.
         body: The hand as a body of its own.
+        felt: The body on which the felt force acts, from `felt.felt_body`.
         grip: True if the hand cannot lose the handle.
         origin: Position of the wall in each cycle [rad], shape (n,).
         pull: Force of the hand's script at each SYNC [N·m], shape (n,).
@@ -31,6 +33,7 @@ class ReferentInputs(NamedTuple):
     handle: NDArray[np.void]
     joined: NDArray[np.void]
     body: HandBody
+    felt: HandBody
     grip: bool
     origin: Array
     pull: Array
@@ -40,20 +43,24 @@ class ReferentInputs(NamedTuple):
 
 
 @compiled
-def follow_referent(inputs: ReferentInputs, stiffness: Array, damping: Array, y: Array) -> None:
-    """Fill y with the positions of the continuous referent at each SYNC, relative to the wall.
+def follow_referent(
+    inputs: ReferentInputs, stiffness: Array, damping: Array, y: Array, felt: Array
+) -> None:
+    """Follow the continuous referent from SYNC to SYNC.
 
     Args:
         inputs: Hand and handle.
         stiffness: Stiffness of the wall in each cycle [N·m/rad], shape (n,).
         damping: Damping of the wall in each cycle [N·m·s/rad], shape (n,).
-        y: Result [rad], shape (n,).
+        y: Result: positions at each SYNC, relative to the wall [rad], shape (n,).
+        felt: Result: mean force on the hand over the period from each SYNC on [N·m], shape (n,).
     """
     y[0] = inputs.rest - inputs.origin[0]
     if inputs.grip:
-        _follow_joined(inputs, stiffness, damping, y)
+        _follow_joined(inputs, stiffness, damping, y, felt)
     else:
-        _follow_grasp(inputs, stiffness, damping, y)
+        _follow_grasp(inputs, stiffness, damping, y, felt)
+    felt[-1] = felt[-2] if len(felt) > 1 else 0.0
 
 
 @compiled
@@ -65,19 +72,34 @@ def _set_wall(plant: Record, stiffness: float, damping: float, origin: float) ->
 
 
 @compiled
-def _follow_joined(inputs: ReferentInputs, stiffness: Array, damping: Array, y: Array) -> None:
-    """Fill y from y[0] on, starting at rest, with a hand that cannot lose the handle."""
+def _felt(
+    inputs: ReferentInputs, j: int, y: float, v: float, y_next: float, v_next: float
+) -> float:
+    """Return the mean force on the hand over period j."""
+    push = inputs.pull[j] + 0.5 * inputs.slope[j] * inputs.period
+    return mean_force(inputs.felt, y, v, y_next, v_next, push, inputs.period)
+
+
+@compiled
+def _follow_joined(
+    inputs: ReferentInputs, stiffness: Array, damping: Array, y: Array, felt: Array
+) -> None:
+    """Fill y and felt from y[0] on, starting at rest, with a hand that cannot lose the handle."""
     plant: Record = inputs.joined[0]
     v = 0.0
     for j in range(len(y) - 1):
         _set_wall(plant, stiffness[j], damping[j], inputs.origin[j])
+        before = v
         y_next, v, _ = advance(plant, y[j], v, inputs.pull[j], inputs.slope[j], inputs.period)
+        felt[j] = _felt(inputs, j, y[j], before, y_next, v)
         y[j + 1] = y_next + inputs.origin[j] - inputs.origin[j + 1]
 
 
 @compiled
-def _follow_grasp(inputs: ReferentInputs, stiffness: Array, damping: Array, y: Array) -> None:
-    """Fill y from y[0] on, starting at rest, with a hand that can lose the handle."""
+def _follow_grasp(
+    inputs: ReferentInputs, stiffness: Array, damping: Array, y: Array, felt: Array
+) -> None:
+    """Fill y and felt from y[0] on, starting at rest, with a hand that can lose the handle."""
     handle: Record = inputs.handle[0]
     joined: Record = inputs.joined[0]
     now = Grasp(y[0], 0.0, y[0], 0.0, True)
@@ -85,7 +107,9 @@ def _follow_grasp(inputs: ReferentInputs, stiffness: Array, damping: Array, y: A
         _set_wall(handle, stiffness[j], damping[j], inputs.origin[j])
         _set_wall(joined, stiffness[j], damping[j], inputs.origin[j])
         script = Force(inputs.pull[j], inputs.slope[j], 0.0, 0.0)
+        hand_y, hand_v = now.hand_y, now.hand_v
         now = advance_grasp(handle, joined, inputs.body, now, _NO_MOTOR, script, inputs.period)
+        felt[j] = _felt(inputs, j, hand_y, hand_v, now.hand_y, now.hand_v)
         shift = inputs.origin[j] - inputs.origin[j + 1]
         now = Grasp(now.y + shift, now.v, now.hand_y + shift, now.hand_v, now.touching)
         y[j + 1] = now.y

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.analysis import metrics
+from canwall.analysis.felt import FeltBand, band_rms
 from canwall.compiled import Record, compiled
 
 Array = NDArray[np.float64]
@@ -14,6 +15,9 @@ Array = NDArray[np.float64]
 MEASURES = np.dtype(
     [
         ("chatters", "?"),
+        ("chatters_counts", "?"),
+        ("chatters_amplitude", "?"),
+        ("chatters_ripple", "?"),
         ("settled", "?"),
         ("trip", "i1"),
         ("contacts", "i4"),
@@ -22,6 +26,8 @@ MEASURES = np.dtype(
         ("motion", "f8"),
         ("referent_motion", "f8"),
         ("tolerance", "f8"),
+        ("ripple", "f8"),
+        ("referent_ripple", "f8"),
         ("amplitude", "f8"),
         ("frequency", "f8"),
         ("energy_out", "f8"),
@@ -29,6 +35,8 @@ MEASURES = np.dtype(
         ("energy_tolerance", "f8"),
         ("peak_torque", "f8"),
         ("penetration", "f8"),
+        ("first_depth", "f8"),
+        ("referent_first_depth", "f8"),
         ("rate_hardness", "f8"),
         ("restitution", "f8"),
         ("referent_restitution", "f8"),
@@ -42,7 +50,10 @@ MEASURE_DESCRIPTIONS = {
         "1",
         "chatter by theory, section 5, or a trip while the referent stays within the limits",
     ),
-    "settled": ("1", "the referent settles, so that the amplitude can be judged"),
+    "chatters_counts": ("1", "chatter by makes and breaks of contact"),
+    "chatters_amplitude": ("1", "chatter by the motion about the settled contact"),
+    "chatters_ripple": ("1", "chatter by the felt ripple"),
+    "settled": ("1", "the referent settles, so that motion and ripple can be judged"),
     "trip": ("1", "the limit that ended the strike (cycle.Trip), 0: none"),
     "contacts": ("1", "contacts of the strike"),
     "events": ("1", "makes and breaks of contact within the busiest 200 ms"),
@@ -50,6 +61,8 @@ MEASURE_DESCRIPTIONS = {
     "motion": ("rad", "peak to peak about the settled contact"),
     "referent_motion": ("rad", "the same of the continuous referent"),
     "tolerance": ("rad", "motion that quantisation explains"),
+    "ripple": ("N", "felt ripple: force on the hand, r.m.s. in 20-500 Hz, at the handle"),
+    "referent_ripple": ("N", "the same of the continuous referent"),
     "amplitude": ("rad", "half peak to peak of the chatter, 0: none"),
     "frequency": ("Hz", "frequency of the chatter, 0: none"),
     "energy_out": ("J", "most energy that the wall had put out at any time"),
@@ -57,13 +70,15 @@ MEASURE_DESCRIPTIONS = {
     "energy_tolerance": ("J", "one encoder count times the peak torque"),
     "peak_torque": ("N*m", "largest torque commanded"),
     "penetration": ("rad", "deepest position inside the wall"),
+    "first_depth": ("rad", "deepest position of the first contact"),
+    "referent_first_depth": ("rad", "the same of the continuous referent"),
     "rate_hardness": ("N*m/rad", "initial rise of the force over the approach speed"),
     "restitution": ("1", "speed out over speed in, first contact"),
     "referent_restitution": ("1", "the same of the continuous referent"),
 }
 
 #: Samples over which speeds before and after a contact, and the rise of the force, are averaged.
-_SPAN = 5
+SPAN = 5
 
 
 @compiled
@@ -73,8 +88,12 @@ def measure_strike(
     torque: Array,
     trip: int,
     thrown: bool,
+    felt: Array,
     referent: Array,
+    referent_felt: Array,
     period: float,
+    band: FeltBand,
+    radius: float,
     count: float,
     torque_step: float,
     stiffness: float,
@@ -88,8 +107,12 @@ def measure_strike(
         torque: Commanded torques [N·m], shape (n,).
         trip: The limit that ended the strike, 0 for none.
         thrown: True if the wall threw the handle beyond limits that the referent keeps.
+        felt: Mean forces on the hand over each period [N·m], shape (n,).
         referent: Positions of the continuous referent [rad], shape (n,).
+        referent_felt: Its mean forces on the hand [N·m], shape (n,).
         period: Period of the SYNC [s].
+        band: Band of the felt ripple, from `felt.felt_band`.
+        radius: Radius of the handle [m].
         count: One encoder count Δ [rad].
         torque_step: One step of torque f_LSB [N·m].
         stiffness: Stiffness of the wall [N·m/rad].
@@ -102,30 +125,38 @@ def measure_strike(
     into.tolerance = tolerance
     into.events = metrics.busiest_window(y, window, count)
     into.referent_events = metrics.busiest_window(referent, window, count)
-    start, stop = metrics.settled_window(referent, tolerance, period)
+    rest, start, stop = metrics.settled_window(referent, tolerance, period)
     into.settled = stop > start
     into.motion = metrics.peak_to_peak(y[start:stop])
     into.referent_motion = metrics.peak_to_peak(referent[start:stop])
-    into.chatters = (
-        thrown
-        or into.events - into.referent_events >= metrics.EVENTS_OF_CHATTER
-        or into.motion - into.referent_motion > tolerance
+    into.ripple = band_rms(band, felt[rest:], start - rest, stop - rest) / radius
+    into.referent_ripple = band_rms(band, referent_felt[rest:], start - rest, stop - rest) / radius
+    _integrate_energy(into, y, force)
+    into.peak_torque = np.abs(torque).max() if len(torque) else 0.0
+    into.energy_tolerance = count * into.peak_torque
+    into.chatters_counts = metrics.bounces_more(
+        into.events, into.referent_events, into.energy_out > into.energy_tolerance
     )
+    into.chatters_amplitude = into.motion - into.referent_motion > tolerance
+    into.chatters_ripple = metrics.is_felt(into.ripple, into.referent_ripple)
+    moves = thrown or into.chatters_counts or into.chatters_amplitude
+    into.chatters = moves or into.chatters_ripple
     first, after, contacts = _count_contacts(y, force)
     into.contacts = contacts
     into.amplitude = into.frequency = 0.0
     if into.chatters:
         cycle = y[start:stop] if stop > start else y[first:after]
         into.amplitude, into.frequency = metrics.limit_cycle(cycle, period)
-    _integrate_energy(into, y, force)
-    into.peak_torque = np.abs(torque).max() if len(torque) else 0.0
-    into.energy_tolerance = count * into.peak_torque
+        if not moves:  # it may be felt within one count
+            _, into.frequency = metrics.limit_cycle(felt[start:stop], period)
     into.penetration = max(-y.min(), 0.0) if len(y) else 0.0
-    speed, into.restitution = _first_bounce(y, period)
-    _, into.referent_restitution = _first_bounce(referent, period)
+    into.first_depth = first_depth(y)
+    into.referent_first_depth = first_depth(referent)
+    speed, into.restitution = first_bounce(y, period)
+    _, into.referent_restitution = first_bounce(referent, period)
     into.rate_hardness = math.nan
-    if speed < 0.0 and first + _SPAN < len(force):
-        into.rate_hardness = -(force[first + _SPAN] - force[first]) / (_SPAN * period) / speed
+    if speed < 0.0 and first + SPAN < len(force):
+        into.rate_hardness = -(force[first + SPAN] - force[first]) / (SPAN * period) / speed
 
 
 @compiled
@@ -157,23 +188,34 @@ def _integrate_energy(into: Record, y: Array, force: Array) -> None:
 
 
 @compiled
-def _first_bounce(y: Array, period: float) -> tuple[float, float]:
+def first_depth(y: Array) -> float:
+    """Return the deepest position inside the wall of the first contact; NaN if there is none."""
+    deepest = 0.0
+    for position in y:
+        deepest = max(deepest, -position)
+        if deepest > 0.0 and position >= 0.0:
+            break
+    return deepest if deepest > 0.0 else math.nan
+
+
+@compiled
+def first_bounce(y: Array, period: float) -> tuple[float, float]:
     """Return the speed into the first contact and the restitution; NaN if there is none.
 
-    Speeds are means over the _SPAN samples before the contact and after it.
+    Speeds are means over the SPAN samples before the contact and after it.
     """
     enter = 0
     while enter < len(y) and y[enter] >= 0.0:
         enter += 1
-    if enter <= _SPAN or enter >= len(y):
+    if enter <= SPAN or enter >= len(y):
         return math.nan, math.nan
-    speed = (y[enter - 1] - y[enter - 1 - _SPAN]) / (_SPAN * period)
+    speed = (y[enter - 1] - y[enter - 1 - SPAN]) / (SPAN * period)
     leave = enter
     while leave < len(y) and y[leave] < 0.0:
         leave += 1
-    if leave + _SPAN >= len(y) or not speed < 0.0:
+    if leave + SPAN >= len(y) or not speed < 0.0:
         return speed, math.nan
-    for j in range(leave, leave + _SPAN):
+    for j in range(leave, leave + SPAN):
         if y[j] < 0.0:
             return speed, math.nan
-    return speed, -(y[leave + _SPAN] - y[leave]) / (_SPAN * period) / speed
+    return speed, -(y[leave + SPAN] - y[leave]) / (SPAN * period) / speed

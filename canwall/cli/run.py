@@ -162,6 +162,8 @@ def _strike_table(strikes: list[dict[str, Any]]) -> Table:
     table.add_column("contacts", justify="right")
     table.add_column("deepest\n\\[mrad]", justify="right")
     table.add_column("energy out\n\\[mJ]", justify="right")
+    table.add_column("first depth\n÷ referent", justify="right")
+    table.add_column("ripple\n\\[N]", justify="right")
     table.add_column("chatter", no_wrap=True)
     for number, strike in enumerate(strikes, start=1):
         chatter = "no"
@@ -174,6 +176,13 @@ def _strike_table(strikes: list[dict[str, Any]]) -> Table:
             str(strike["contacts"]),
             f"{strike['peak_penetration_rad'] * 1e3:.2f}",
             f"{strike['energy_out_j'] * 1e3:z.2f}",
+            _depth_ratio(strike),
+            "–" if strike["felt_ripple_n"] is None else f"{strike['felt_ripple_n']:.2f}",
             chatter,
         )
     return table
+
+
+def _depth_ratio(strike: dict[str, Any]) -> str:
+    depth, referent = strike["first_depth_rad"], strike["referent_first_depth_rad"]
+    return "–" if depth is None or referent is None else f"{depth / referent:.2f}"

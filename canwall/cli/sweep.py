@@ -34,8 +34,8 @@ def sweep(
         typer.Option(
             metavar="NAME=VALUES",
             help="Any other axis: a key of the configuration, or delay, counts, torque_step, "
-            "model, model_error, servo, speed, phase, start, press, stiffness_normalised, "
-            "damping_normalised; VALUES: A,B,C or LO:HI:N.",
+            "model, model_error, servo, speed, phase, start, press, press_torque, "
+            "stiffness_normalised, damping_normalised; VALUES: A,B,C or LO:HI:N.",
         ),
     ] = None,
     through: Annotated[str, typer.Option(help="sim: in memory; bus: by frames.")] = "sim",

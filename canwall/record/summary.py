@@ -1,11 +1,14 @@
 """Summary of a run: metrics of its record, strike by strike."""
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from canwall.analysis import metrics
+from canwall.analysis.felt import HANDLE_RADIUS_M, band_rms, felt_band
+from canwall.analysis.strike import SPAN, first_bounce, first_depth
 from canwall.config import Settings
 from canwall.record.columns import Phase
 from canwall.record.folder import numbers
@@ -16,9 +19,17 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+#: Shortest contact whose ripple is judged without a referent to tell where it settles [s].
+_LONG_CONTACT_S = 0.2
+_SOURCE = ", estimated from the torque"
+
 
 def summarise(
-    signals: "pa.Table", settings: Settings, units: DriveUnits, referent: Array | None
+    signals: "pa.Table",
+    settings: Settings,
+    units: DriveUnits,
+    referent: Array | None,
+    referent_felt: Array | None,
 ) -> dict[str, Any]:
     """Return energy, contacts and chatter of a run.
 
@@ -28,6 +39,7 @@ def summarise(
         units: Scales of the drive.
         referent: Positions at the continuous wall at the same SYNCs, shape (n,); None if a person
             was at the handle.
+        referent_felt: Mean forces on the hand there [N·m], shape (n,), or None.
     """
     y, force = numbers(signals, "y"), numbers(signals, "force_applied")
     stiffness, laws = numbers(signals, "stiffness"), signals["law"]
@@ -35,7 +47,7 @@ def summarise(
     work = metrics.energy_out(y, force)
     touched = metrics.contacts(np.where(rendering, y, np.inf), force)
     strikes = [
-        _strike(strike, y, force, work, stiffness, laws, settings, units, referent)
+        _strike(strike, y, force, work, stiffness, laws, settings, units, referent, referent_felt)
         for strike in metrics.strikes(touched, settings.bus.cycle_s, _changes(signals))
     ]
     chattering = [s for s in strikes if s["chatter"]]
@@ -74,6 +86,7 @@ def _strike(
     settings: Settings,
     units: DriveUnits,
     referent: Array | None,
+    referent_felt: Array | None,
 ) -> dict[str, Any]:
     cycles, start = strike.cycles, strike.cycles.start
     period = settings.bus.cycle_s
@@ -81,15 +94,27 @@ def _strike(
     tolerance = metrics.amplitude_tolerance(
         float(stiffness[start]), units.rad_per_count, units.nm_per_mille
     )
+    running = work[cycles] - work[start]
+    energy_tolerance = units.rad_per_count * float(np.abs(force[cycles]).max(initial=0.0))
+    if referent is None or referent_felt is None:
+        ripple = _ripple_of_contact(strike, force, settings)
+    else:
+        rest, first, last = metrics.settled_window(referent[cycles], tolerance, period)
+        windows = (rest + start, first + start, last + start)
+        ripple = metrics.Ripple(
+            _felt(force, *windows, settings), _felt(referent_felt, *windows, settings), _SOURCE
+        )
     verdict = metrics.chatter(
         inside,
         None if referent is None else referent[cycles],
         period,
         tolerance,
         units.rad_per_count,
+        bool(running.max() > energy_tolerance),
+        ripple,
     )
     amplitude, frequency = metrics.limit_cycle(inside, period) if verdict.chatters else (0.0, 0.0)
-    running = work[cycles] - work[start]
+    around = slice(max(start - SPAN - 1, 0), cycles.stop + SPAN)
     return {
         "start_s": start * period,
         "end_s": cycles.stop * period,
@@ -97,11 +122,40 @@ def _strike(
         "stiffness": float(stiffness[start]),
         "contacts": len(strike.contacts),
         "peak_penetration_rad": float(-inside.min(initial=0.0)),
+        "first_depth_rad": _known(first_depth(inside)),
+        "referent_first_depth_rad": _known(
+            math.nan if referent is None else first_depth(referent[cycles])
+        ),
+        "restitution": _known(first_bounce(y[around], period)[1]),
         "peak_force_nm": float(force[cycles].max(initial=0.0)),
         "energy_out_j": float(running[-1]),
         "energy_out_max_j": float(running.max()),
         "chatter": verdict.chatters,
         "chatter_reason": verdict.reason,
+        "chatter_by": verdict.by,
+        "felt_ripple_n": _known(ripple.measured),
         "chatter_amplitude_rad": amplitude,
         "chatter_frequency_hz": frequency,
     }
+
+
+def _felt(force: Array, start: int, first: int, last: int, settings: Settings) -> float:
+    """Return the r.m.s. of a force in the felt band over [first, last), at the handle [N]."""
+    radius = settings.mechanics.handle_radius_m or HANDLE_RADIUS_M
+    band = felt_band(settings.bus.cycle_s)
+    return band_rms(band, force[start:last], first - start, last - start) / radius
+
+
+def _ripple_of_contact(
+    strike: metrics.StrikeContacts, force: Array, settings: Settings
+) -> metrics.Ripple:
+    """Return the ripple of the longest contact, if it is long enough to have settled."""
+    longest = max(strike.contacts, key=lambda contact: contact.stop - contact.start)
+    if (longest.stop - longest.start) * settings.bus.cycle_s < _LONG_CONTACT_S:
+        return metrics.Ripple()
+    first, last = metrics.judged_part(longest.start, longest.stop)
+    return metrics.Ripple(_felt(force, longest.start, first, last, settings), 0.0, _SOURCE)
+
+
+def _known(value: float) -> float | None:
+    return None if math.isnan(value) else float(value)

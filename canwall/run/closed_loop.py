@@ -13,14 +13,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from canwall.analysis.felt import felt_body, mean_force
 from canwall.compiled import Record, compiled, copied
 from canwall.config import ConfigError, Settings
 from canwall.cycle import Trip, fade_in, make_cycle, run_laws, start_at, step
 from canwall.drive import DriveSetup, DriveState, Field, PdoLayout
 from canwall.drive import objects as od
+from canwall.physics import HandBody
 from canwall.record import ROW, Phase
 from canwall.simdrive import (
     ServoScales,
+    hand_body,
     hand_force,
     make_servo,
     move_servo,
@@ -99,6 +102,7 @@ class LoopRecords(NamedTuple):
         servo_before: Bytes of `servo` at the start.
         push: Force of the hand at the SYNC of each cycle [N·m], shape (cycles,).
         slope: Its slope over the cycle [N·m/s], shape (cycles,).
+        felt: The body on which the felt force acts, from `felt_body`.
         nm_per_mille: Torque of one per mille at the shaft [N·m].
         whole: Whole periods of the delay D.
         share: Rest of the delay D [periods].
@@ -116,6 +120,7 @@ class LoopRecords(NamedTuple):
     servo_before: Bytes
     push: Array
     slope: Array
+    felt: HandBody
     nm_per_mille: float
     whole: int
     share: float
@@ -146,7 +151,7 @@ def simulate(
         ConfigError: If only a run can render the configuration.
     """
     loop = ClosedLoop(settings, cycles, enabling, disturbances)
-    records, rows, signals = loop.records(), np.zeros(cycles, ROW), np.empty((3, cycles))
+    records, rows, signals = loop.records(), np.zeros(cycles, ROW), np.empty((4, cycles))
     done = simulate_loop(records, rows, signals)
     trip = Trip(int(records.cycle["trip"][0]))
     lag = int(records.cycle["lag"][0])
@@ -185,6 +190,7 @@ class ClosedLoop:
                 f"compensate for {MAX_DELAY} at most"
             )
         self._push, self._slope = hand_force(simulation.hand, settings.bus.cycle_s, cycles)
+        self._felt = felt_body(hand_body(simulation), simulation.inertia_kg_m2)
         self._nm_per_mille = scales.rated_torque_mnm * _PER_MILLE_MILLI * scales.gear_ratio
         self._whole = math.floor(delay)
         self._share = delay - self._whole
@@ -203,6 +209,7 @@ class ClosedLoop:
             self._servo.view(np.uint8),
             self._push,
             self._slope,
+            self._felt,
             self._nm_per_mille,
             self._whole,
             self._share,
@@ -275,8 +282,9 @@ def simulate_loop(loop: LoopRecords, rows: NDArray[np.void], signals: Array) -> 
     Args:
         loop: The loop.
         rows: Rows of the last cycles, shape (n,), dtype ROW: cycle j is in j modulo n.
-        signals: Result, shape (3, cycles): position relative to the wall [rad]; force held from
-            each SYNC on, out of the wall [N·m]; commanded torque [N·m].
+        signals: Result, shape (4, cycles): position relative to the wall [rad]; force held from
+            each SYNC on, out of the wall [N·m]; commanded torque [N·m]; mean force on the hand over
+            the cycle [N·m].
 
     Returns:
         Number of cycles, up to a trip.
@@ -344,12 +352,17 @@ def _run_cycles(loop: LoopRecords, rows: NDArray[np.void], signals: Array) -> in
         for k in range(MAX_DELAY + 1, 0, -1):
             sent[k] = sent[k - 1]
         sent[0] = cycle.torque_per_mille
+        hand_y, hand_v = servo.hand_y, servo.hand_v
         before = share * period
         if share > 0.0:
             move_servo(servos, sent[whole + 1] * nm_per_mille, push[j], slope[j], before)
         after = push[j] + slope[j] * before if share > 0.0 else push[j]
         torque = sent[whole] * nm_per_mille
         counts = move_servo(servos, torque, after, slope[j], period - before)
+        mean_push = push[j] + 0.5 * slope[j] * period
+        signals[3, j] = mean_force(
+            loop.felt, hand_y, hand_v, servo.hand_y, servo.hand_v, mean_push, period
+        )
         if skipped[j]:
             # The hand, whose script is one of SYNCs, waits.
             after = push[j] + slope[j] * period

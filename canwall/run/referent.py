@@ -1,10 +1,13 @@
 """Continuous referent of a configuration (`analysis.referent`), with the simulated hand."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from canwall import simdrive
 from canwall.analysis import ReferentInputs, follow_referent
+from canwall.analysis.felt import felt_body
 from canwall.compiled import copied
 from canwall.config import Settings, Simulation
 from canwall.physics import make_plant
@@ -12,10 +15,22 @@ from canwall.physics import make_plant
 Array = NDArray[np.float64]
 
 
-def referent_positions(
+class ReferentMotion(NamedTuple):
+    """Motion of the continuous referent at each SYNC.
+
+    Attributes:
+        y: Positions relative to the wall [rad], shape (n,).
+        felt: Mean forces on the hand over the period from each SYNC on [N·m], shape (n,).
+    """
+
+    y: Array
+    felt: Array
+
+
+def referent_motion(
     settings: Settings, stiffness: Array, damping: Array, wall_position: Array
-) -> Array | None:
-    """Return the positions of the continuous referent at each SYNC of a run, relative to the wall.
+) -> ReferentMotion | None:
+    """Return the motion of the continuous referent of a run.
 
     The referent is the same hand with the same script on the same handle, against the continuous
     wall of each cycle.
@@ -27,11 +42,11 @@ def referent_positions(
         wall_position: Position of the wall in each cycle [rad], shape (n,).
 
     Returns:
-        Positions [rad], shape (n,); None without `[simulation]`, as a person's hand is not known.
+        The motion; None without `[simulation]`, as a person's hand is not known.
     """
     if settings.simulation is None:
         return None
-    return Referent(settings, settings.simulation, len(stiffness)).positions(
+    return Referent(settings, settings.simulation, len(stiffness)).motion(
         stiffness, damping, wall_position
     )
 
@@ -49,12 +64,13 @@ class Referent:
         self._joined = make_plant(**simdrive.hand_plant(simulation))
         body = simdrive.hand_body(simulation)
         self._body = body._replace(side=self._side * body.side)
+        self._felt = felt_body(self._body, simulation.inertia_kg_m2)
 
-    def positions(self, stiffness: Array, damping: Array, wall_position: Array) -> Array:
-        """Return the same as `referent_positions`."""
-        y = np.empty(len(stiffness))
-        follow_referent(self.inputs(wall_position), stiffness, damping, y)
-        return y
+    def motion(self, stiffness: Array, damping: Array, wall_position: Array) -> ReferentMotion:
+        """Return the same as `referent_motion`."""
+        motion = ReferentMotion(np.empty(len(stiffness)), np.empty(len(stiffness)))
+        follow_referent(self.inputs(wall_position), stiffness, damping, *motion)
+        return motion
 
     def inputs(self, wall_position: Array) -> ReferentInputs:
         """Return the inputs of `follow_referent`; wall_position [rad] has shape (n,)."""
@@ -63,6 +79,7 @@ class Referent:
             copied(self._handle),
             copied(self._joined),
             self._body,
+            self._felt,
             self._hand.grip,
             origin,
             # The hand's spring in coordinates measured from the wall.

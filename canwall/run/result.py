@@ -9,7 +9,7 @@ from canwall.drive import DriveSetup
 from canwall.errors import RunFailedError
 from canwall.record import RecordError, RunFolder, numbers, read_signals
 from canwall.record.summary import summarise
-from canwall.run.referent import referent_positions
+from canwall.run.referent import referent_motion
 from canwall.units import DriveUnits
 
 if TYPE_CHECKING:
@@ -91,7 +91,8 @@ def write_result(
 def judged(signals: "pa.Table", settings: Settings, units: DriveUnits) -> dict[str, Any]:
     """Return what the summary has from the rows, judged against the continuous referent."""
     wall = (numbers(signals, name) for name in ("stiffness", "damping", "wall_position_rad"))
-    return summarise(signals, settings, units, referent_positions(settings, *wall))
+    referent = referent_motion(settings, *wall)
+    return summarise(signals, settings, units, *((None, None) if referent is None else referent))
 
 
 def _remarks_on_lag(axis: WallAxis) -> list[str]:

@@ -35,6 +35,7 @@ class Verdict:
     chatter_reason: str
     energy_out_j: float
     peak_force_nm: float
+    felt_ripple_n: float | None
     ended_by: str
 
 
@@ -190,6 +191,10 @@ class Session:
             chattering[0]["chatter_reason"] if chattering else "",
             max(s["energy_out_max_j"] for s in strikes),
             max(s["peak_force_nm"] for s in strikes),
+            max(
+                (s["felt_ripple_n"] for s in strikes if s["felt_ripple_n"] is not None),
+                default=None,
+            ),
             "; ".join(result.outcome.trips),
         )
         self.verdicts.append(verdict)

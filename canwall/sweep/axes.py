@@ -41,6 +41,7 @@ NAMED = {
     "phase": ("1", "phase of the contact relative to the SYNC"),
     "start": ("rad", "distance from the wall at which the handle rests before the strike"),
     "press": ("s", "time for which the hand presses"),
+    "press_torque": ("N*m", "torque with which the hand presses"),
 }
 #: Axes of the wall itself: a strike is prepared once for all of their values.
 STIFFNESS = ("stiffness", "stiffness_normalised")
@@ -54,6 +55,7 @@ DEFAULTS: dict[str, tuple[Value, ...]] = {
     "servo": ("file",),
     "start": (0.03,),
     "press": (0.6,),
+    "press_torque": (0.15,),
     "speed": (0.5, 1.0, 2.0),
     "phase": (0.0, 0.35, 0.7),
 }
@@ -177,8 +179,8 @@ def settings_at(base: Settings, point: Point) -> Settings:
         settings = settings.model_copy(
             update={"estimator": settings.estimator.model_copy(update=known)}
         )
-    speed, phase, start, press = (float(values[n]) for n in ("speed", "phase", "start", "press"))
-    return strike_settings(settings, speed, phase, start, press)
+    strike = (float(values[n]) for n in ("speed", "phase", "start", "press", "press_torque"))
+    return strike_settings(settings, *strike)
 
 
 def _of_the_model(key: str) -> bool:

@@ -21,8 +21,8 @@ from canwall.sweep.plan import Plan
 #: (unit, description) of what a search finds besides MEASURES.
 _LIMIT_DESCRIPTIONS = {
     "limit": ("N*m/rad", "K-limit of this strike alone"),
-    "open_ended": ("1", "no chatter up to the end of the search: the limit is that end"),
-    "worst": ("N*m/rad", "K-limit: free of chatter at all speeds and phases"),
+    "open_ended": ("1", "no chatter up to the end of the scan: the limit is that end"),
+    "worst": ("N*m/rad", "K-limit: no wall of the scan up to it chatters, at any speed and phase"),
 }
 #: (unit, description) of the parameters at each condition, for the analytic limits.
 _PARAMETER_DESCRIPTIONS = {

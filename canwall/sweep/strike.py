@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.analysis import ReferentInputs, follow_referent
+from canwall.analysis.felt import HANDLE_RADIUS_M, FeltBand, felt_band
 from canwall.analysis.strike import MEASURES, measure_strike
 from canwall.compiled import Record, compiled
 from canwall.config import ConfigError, Hand, Mechanics, Settings
@@ -43,12 +44,9 @@ class Operator:
         }
 
 
-_RADIUS_M = 0.08
-
-
 def _at_radius(name: str, mass_kg: float, damping: float, stiffness: float) -> Operator:
     """Convert mass [kg], damping [N·s/m] and stiffness [N/m] at a handle of 80 mm."""
-    square = _RADIUS_M**2
+    square = HANDLE_RADIUS_M**2
     return Operator(name, mass_kg * square, damping * square, stiffness * square)
 
 
@@ -64,9 +62,10 @@ OPERATORS = {
     )
 }
 
-_PRESSING_NM = 0.15
 _FIRST_STRIKE_S = 0.05
 _AFTERWARDS_S = 0.25
+#: Part of the way from the wall to a limit of position up to which a wall holds the hand.
+_HELD_WITHIN = 0.25
 #: Cycles of rest between enabling and the strike: at 100 Hz _FIRST_STRIKE_S is too short for it.
 _AT_REST_CYCLES = 3
 #: Longest strike: 100 MB of signals.
@@ -98,14 +97,20 @@ def law_model(settings: Settings, knows: str, error: float) -> Mechanics:
             inertia_kg_m2=simulation.inertia_kg_m2 + hand.inertia_kg_m2,
             viscous_nm_s_per_rad=simulation.viscous_nm_s_per_rad + hand.damping_nm_s_per_rad,
             coulomb_nm=simulation.coulomb_nm,
+            handle_radius_m=settings.mechanics.handle_radius_m,
         )
     return model.model_copy(update={"inertia_kg_m2": model.inertia_kg_m2 * (1.0 + error)})
 
 
 def strike_settings(
-    settings: Settings, speed_rad_s: float, phase: float, start_rad: float, press_s: float
+    settings: Settings,
+    speed_rad_s: float,
+    phase: float,
+    start_rad: float,
+    press_s: float,
+    press_nm: float,
 ) -> Settings:
-    """Return settings with which the operator strikes the wall once and presses with 0.15 N·m.
+    """Return settings with which the operator strikes the wall once and presses.
 
     Args:
         settings: Configuration with `[simulation]`; its hand is the operator.
@@ -114,6 +119,7 @@ def strike_settings(
             the way of one period.
         start_rad: Distance from the wall at which the approach starts [rad].
         press_s: Time for which the hand presses [s].
+        press_nm: Torque with which it presses [N·m].
 
     Raises:
         ConfigError: If the strike has too many cycles.
@@ -125,7 +131,7 @@ def strike_settings(
     start = start_rad + phase * speed_rad_s * period
     stiffness = simulation.hand.stiffness_nm_per_rad
     # A hand with a spring presses through it, one without by its muscle torque alone.
-    depth = _PRESSING_NM / stiffness if stiffness > 0.0 else 0.0
+    depth = press_nm / stiffness if stiffness > 0.0 else 0.0
     travel_s = (start + depth) / speed_rad_s
     first_s = max(_FIRST_STRIKE_S, (ENABLING_CYCLES + _AT_REST_CYCLES) * period)
     hand = simulation.hand.model_copy(
@@ -134,7 +140,7 @@ def strike_settings(
             "first_strike_s": first_s,
             "rest_rad": wall + sign * start,
             "press_rad": wall - sign * depth,
-            "press_torque_nm": 0.0 if stiffness > 0.0 else -sign * _PRESSING_NM,
+            "press_torque_nm": 0.0 if stiffness > 0.0 else -sign * press_nm,
             "approach_s": travel_s,
             "press_s": press_s,
             "withdraw_s": travel_s,
@@ -169,6 +175,8 @@ class PreparedStrike:
         self._loop = ClosedLoop(settings, self._cycles).records()
         referent = Referent(settings, settings.simulation, self._cycles)
         self._referent = referent.inputs(np.full(self._cycles, settings.wall.position_rad))
+        self._band = felt_band(settings.bus.cycle_s)
+        self._radius = settings.mechanics.handle_radius_m or HANDLE_RADIUS_M
         self._by_frames = through == "bus"
 
     @property
@@ -182,6 +190,15 @@ class PreparedStrike:
     def period(self) -> float:
         """Period T of the SYNC [s]."""
         return self._settings.bus.cycle_s
+
+    @property
+    def softest(self) -> float:
+        """Stiffness that holds the pressing hand within _HELD_WITHIN of the way [N·m/rad]."""
+        assert self._settings.simulation is not None
+        hand, wall = self._settings.simulation.hand, self._settings.wall.position_rad
+        press = abs(hand.press_torque_nm) + hand.stiffness_nm_per_rad * abs(hand.press_rad - wall)
+        way = min(abs(limit - wall) for limit in self._settings.limits.position_rad)
+        return press / (_HELD_WITHIN * way)
 
     def on(self, stiffness: float, damping: float) -> np.void:
         """Strike a wall of this stiffness [N·m/rad] and damping [N·m·s/rad]; dtype MEASURES."""
@@ -203,7 +220,15 @@ class PreparedStrike:
         else:
             # One call for all walls: between calls, the threads of a sweep would contend for the
             # interpreter's lock.
-            _strike_all(self._loop, self._referent, walls, np.zeros(1, ROW), measures)
+            _strike_all(
+                self._loop,
+                self._referent,
+                self._band,
+                self._radius,
+                walls,
+                np.zeros(1, ROW),
+                measures,
+            )
         return measures
 
     def _strike_over_bus(self, stiffness: float, damping: float) -> np.void:
@@ -211,57 +236,103 @@ class PreparedStrike:
         signals, trip = signals_over_bus(
             self._settings.model_copy(update={"wall": self._settings.wall.model_copy(update=wall)})
         )
-        referent = np.empty(self._cycles)
+        felt = self._felt_under(signals[2], stiffness, damping)
+        referent, referent_felt = np.empty(self._cycles), np.empty(self._cycles)
         each = np.full(self._cycles, stiffness), np.full(self._cycles, damping)
-        follow_referent(self._referent, *each, referent)
+        follow_referent(self._referent, *each, referent, referent_felt)
         measures = np.zeros(1, MEASURES)
-        _judge(self._loop, signals, trip, referent, stiffness, measures)
+        _judge(
+            self._loop,
+            self._band,
+            self._radius,
+            np.concatenate([signals, felt[None, :]]),
+            trip,
+            referent,
+            referent_felt,
+            stiffness,
+            measures,
+        )
         return measures[0]
+
+    def _felt_under(self, torque: Array, stiffness: float, damping: float) -> Array:
+        """Return the forces on the hand, which no frame tells, under the torques of a strike.
+
+        They are those of the loop in memory, as long as it commands the same torques; NaN after.
+        """
+        again = np.empty((4, self._cycles))
+        done = simulate_wall(self._loop, stiffness, damping, np.zeros(1, ROW), again)
+        again = again[:, self._loop.enabling : done]
+        shared = min(len(torque), again.shape[1])
+        differs = np.flatnonzero(torque[:shared] != again[2, :shared])
+        felt = np.full(len(torque), np.nan)
+        same = differs[0] if len(differs) else shared
+        felt[:same] = again[3, :same]
+        return felt
 
 
 @compiled
 def _strike_all(
     loop: LoopRecords,
     hand: ReferentInputs,
+    band: FeltBand,
+    radius: float,
     walls: Array,
     rows: NDArray[np.void],
     measures: NDArray[np.void],
 ) -> None:
     """Strike and judge every wall; rows, shape (1,) and dtype ROW, is scratch memory."""
     cycles = len(loop.push)
-    signals = np.empty((3, cycles))
-    stiffness, damping, referent = np.empty(cycles), np.empty(cycles), np.empty(cycles)
+    signals = np.empty((4, cycles))
+    stiffness, damping = np.empty(cycles), np.empty(cycles)
+    referent, referent_felt = np.empty(cycles), np.empty(cycles)
     for i in range(len(walls)):
         stiffness[:], damping[:] = walls[i, 0], walls[i, 1]
         done = simulate_wall(loop, walls[i, 0], walls[i, 1], rows, signals)
         cycle: Record = loop.cycle[0]
-        follow_referent(hand, stiffness, damping, referent)
-        rendered = signals[:, loop.enabling : done]
-        _judge(loop, rendered, cycle.trip, referent, walls[i, 0], measures[i : i + 1])
+        follow_referent(hand, stiffness, damping, referent, referent_felt)
+        _judge(
+            loop,
+            band,
+            radius,
+            signals[:, loop.enabling : done],
+            cycle.trip,
+            referent,
+            referent_felt,
+            walls[i, 0],
+            measures[i : i + 1],
+        )
 
 
 @compiled
 def _judge(
     loop: LoopRecords,
+    band: FeltBand,
+    radius: float,
     signals: Array,
     trip: int,
     referent: Array,
+    referent_felt: Array,
     stiffness: float,
     measures: NDArray[np.void],
 ) -> None:
     """Judge one strike into measures, shape (1,).
 
-    signals, shape (3, n), are those of `simulate_loop` from the end of enabling on.
+    signals, shape (4, n), are those of `simulate_loop` from the end of enabling on.
     """
     cycle: Record = loop.cycle[0]
+    rendered = slice(loop.enabling, loop.enabling + signals.shape[1])
     measure_strike(
         signals[0],
         signals[1],
         signals[2],
         trip,
         trip != 0 and not _exceeds_limits(cycle, referent),
-        referent[loop.enabling : loop.enabling + signals.shape[1]],
+        signals[3],
+        referent[rendered],
+        referent_felt[rendered],
         cycle.period,
+        band,
+        radius,
         cycle.rad_per_count,
         cycle.nm_per_mille,
         stiffness,
@@ -288,7 +359,8 @@ def signals_over_bus(settings: Settings) -> tuple[Array, int]:
     """Render the wall of a strike by frames, on an embedded bus.
 
     Returns:
-        The signals of `simulate_loop` from the end of enabling on, shape (3, n), and the trip.
+        The first three signals of `simulate_loop` from the end of enabling on, shape (3, n), and
+        the trip.
     """
     # Each thread has a bus: others may strike at the same time.
     channel = f"{settings.bus.channel}-{threading.get_ident()}"

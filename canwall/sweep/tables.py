@@ -4,6 +4,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 
+import numpy as np
 import xarray as xr
 from rich.markup import escape
 from rich.table import Table
@@ -58,7 +59,17 @@ def _limit_rows(dataset: xr.Dataset) -> Iterator[dict[str, str]]:
             "K\n[N·m/rad]": at_least + f"{limit:.3g}",
             "K·T²/m": at_least + f"{normalised:.3g}",
             "best strike\n÷ worst": f"{best / limit:.3g}" if limit > 0.0 else "–",
+            "ripple\n[N]": _worst(dataset["ripple"].isel(index)),
+            "first depth\n÷ referent": _worst(
+                (dataset["first_depth"] / dataset["referent_first_depth"]).isel(index)
+            ),
         }
+
+
+def _worst(values: xr.DataArray) -> str:
+    """Return the largest known value of all strikes."""
+    known = values.values[np.isfinite(values.values)]
+    return f"{known.max():.2g}" if known.size else "–"
 
 
 def _map_rows(dataset: xr.Dataset) -> Iterator[dict[str, str]]:

@@ -10,10 +10,14 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from canwall.analysis.metrics import (
+    EVENTS_OF_CHATTER,
+    QUIET_N,
     STRIKE_GAP_S,
     Chatter,
+    Ripple,
     StrikeContacts,
     amplitude_tolerance,
+    bounces_more,
     chatter,
     contacts,
     energy_out,
@@ -226,6 +230,31 @@ def test_bounces_that_the_referent_does_not_make_are(more: int, chatters: bool) 
     assert verdict.chatters is chatters  # a bounce is a break and a make
     if chatters:
         assert verdict.reason == f"{2 + 2 * more} makes and breaks within 200 ms, the referent 2"
+
+
+def test_makes_and_breaks_are_compared_relatively() -> None:
+    """25 against 21 is no chatter where no energy came out."""
+    assert not bounces_more(25, 21, gives_energy=False)
+    assert bounces_more(25, 21, gives_energy=True)
+    assert bounces_more(27, 21, gives_energy=False)
+    assert bounces_more(EVENTS_OF_CHATTER, 0, gives_energy=False)
+    assert not bounces_more(2, 0, gives_energy=True)
+
+
+@pytest.mark.parametrize("referent", [pressing(), None])
+def test_a_ripple_that_is_felt_is_chatter(referent: Array | None) -> None:
+    def felt(measured: float, own: float = 0.0) -> Chatter:
+        ripple = Ripple(measured, own, ", by a sensor")
+        return chatter(pressing(), referent, PERIOD, TOLERANCE, COUNT, ripple=ripple)
+
+    assert not felt(0.99 * QUIET_N).chatters
+    assert not felt(0.5, 0.45).chatters
+    assert not felt(math.nan).chatters
+    verdict = felt(0.5)
+    assert (verdict.chatters, verdict.by) == (True, "ripple")
+    assert verdict.reason == (
+        "felt ripple 0.5 N r.m.s. in 20–500 Hz, by a sensor, quiet up to 0.1 N"
+    )
 
 
 def test_bounces_far_apart_are_no_chatter() -> None:

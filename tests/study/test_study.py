@@ -284,7 +284,7 @@ def test_who_errs_once_is_brought_back() -> None:
 
 def test_limits_are_the_stiffest_free_and_the_softest_that_is_not() -> None:
     def verdict(law: str, stiffness: float, free: bool) -> Verdict:
-        return Verdict(1, "", law, stiffness, 1, free, False, "", 0.0, 0.0, "")
+        return Verdict(1, "", law, stiffness, 1, free, False, "", 0.0, 0.0, None, "")
 
     said = [verdict("a", 5, True), verdict("a", 20, False), verdict("a", 10, True)]
     assert stiffness_limits([*said, verdict("b", 5, False)]) == {"a": (10, 20), "b": (0.0, 5)}

@@ -21,6 +21,7 @@ from fork_server import ForkedPopen
 from rig import settings_with
 
 from canwall import cli
+from canwall.analysis.k_limit import FINE_FACTOR
 from canwall.errors import InputError
 from canwall.sweep import Plan, ineffective_axis_notes, make_plan, read_sweep, sweep, sweep_table
 from canwall.sweep.journal import Journal
@@ -116,11 +117,38 @@ def test_a_k_limit_is_free_and_a_little_more_is_not() -> None:
         operator=["finger"],
         speed=[0.5, 2.0],
         phase=[0.0, 0.7],
-        stiffness=[worst, found["limit"].min() * 1.011],
+        stiffness=[worst, found["limit"].min() * FINE_FACTOR],
     )
     chatters = np.array([compute_piece(free, piece)["chatters"][0] for piece in range(free.pieces)])
     assert not chatters[:, 0].any()
     assert chatters[:, 1].any()
+
+
+def test_a_buzz_within_six_counts_is_felt() -> None:
+    """half_sample on a grip at 712 N·m/rad: motion and counts alone called it free up to 791."""
+    wall: dict[str, object] = {"law": ["half_sample"], "operator": ["grip"], "servo": ["ideal"]}
+    plan = plan_of(**wall, stiffness=[100.0, 712.0])
+    quiet, buzzing = compute_piece(plan, 0)[0]
+    assert not quiet["chatters"]
+    assert quiet["ripple"] < 1e-6
+    assert buzzing["chatters"]
+    assert buzzing["chatters_ripple"]
+    assert not buzzing["chatters_counts"]
+    assert not buzzing["chatters_amplitude"]
+    # Of the wall's force, 2.6 N peak to peak, the hand's share of the inertia is felt.
+    felt = 712.0 * buzzing["motion"] / 0.08 * 3.2 / 4.2 / np.sqrt(8.0)
+    assert buzzing["ripple"] == pytest.approx(felt, rel=0.4)
+    assert 200.0 < buzzing["frequency"] < 350.0
+
+
+@pytest.mark.parametrize(
+    "axis",
+    ["simulation.current_bandwidth_hz", "simulation.viscous_nm_s_per_rad", "press_torque"],
+)
+def test_any_number_of_the_plant_is_an_axis(axis: str) -> None:
+    plan = plan_of(stiffness=[20.0], **{axis: [0.1, 0.2]})
+    one, other = (compute_piece(plan, piece)[0, 0] for piece in range(2))
+    assert one["penetration"] != other["penetration"]
 
 
 class StoppedError(Exception):
