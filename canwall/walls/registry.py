@@ -4,6 +4,7 @@ from pathlib import Path
 
 from canwall.walls import (
     damped,
+    energy_bounding,
     exponential,
     half_sample,
     hysteresis,
@@ -17,6 +18,7 @@ from canwall.walls import (
     thresholded_damper,
     two_step,
     unidirectional_damper,
+    virtual_coupling,
 )
 from canwall.walls.interface import DEADBEAT, Law, UnknownLawError
 from canwall.walls.user_law import load_law
@@ -32,6 +34,8 @@ LAWS: dict[str, Law] = {
         thresholded_damper,
         unidirectional_damper,
         offset_damper,
+        energy_bounding,
+        virtual_coupling,
         half_sample,
         pole_placement,
         midpoint,

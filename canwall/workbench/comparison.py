@@ -47,7 +47,8 @@ class LawParameters:
     options: Mapping[str, float] = field(default_factory=dict)
 
 
-#: The laws, grouped by the knowledge that they use.
+#: The laws, grouped by the knowledge that they use. Those that bound their force by the damping of
+#: the device are left out: the ball has none (FORCELESS).
 GROUPS: dict[str, dict[str, LawParameters]] = {
     "laws without a model": {
         "standard": LawParameters(),
@@ -72,6 +73,9 @@ GROUPS: dict[str, dict[str, LawParameters]] = {
         "rigid": LawParameters(options={"restitution": 1.0}),
     },
 }
+
+#: Laws that give a ball no force, since it has no damping.
+FORCELESS = ("energy_bounding", "virtual_coupling")
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,8 @@ def test_every_law_of_the_theory_is_there() -> None:
         "thresholded_damper",
         "unidirectional_damper",
         "offset_damper",
+        "energy_bounding",
+        "virtual_coupling",
         "half_sample",
         "half_sample+deadbeat",
         "pole_placement",

@@ -21,7 +21,7 @@ from canwall.walls import LAWS
 from canwall.workbench import CONTINUOUS, Ball, continuous_ball, on_the_drive, simulate_ball
 from canwall.workbench import figures as figures_module
 from canwall.workbench.bounces import Bounces, entering
-from canwall.workbench.comparison import DAMPING, GROUPS, continuous_result
+from canwall.workbench.comparison import DAMPING, FORCELESS, GROUPS, continuous_result
 from canwall.workbench.figures import Extent, write_figures
 from canwall.workbench.on_the_drive import effort, record_run
 from canwall.workbench.traces import BALL, POINTS, drop_ball
@@ -273,7 +273,7 @@ def test_run_that_did_not_reach_its_end_draws_nothing(
 
 def test_every_law_is_compared(written: Written) -> None:
     grouped = [law for laws in GROUPS.values() for law in laws]
-    assert sorted(grouped) == sorted(LAWS)
+    assert sorted((*grouped, *FORCELESS)) == sorted(LAWS)
     assert list(dict.fromkeys(written.words("all_laws", "law"))) == grouped
 
 
