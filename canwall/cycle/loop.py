@@ -16,8 +16,9 @@ import can
 
 from canwall.cycle.axis import WallAxis, WallStage
 from canwall.cycle.exchange import Exchange
+from canwall.cycle.experiment import Experiment, ExperimentError
 from canwall.cycle.realtime import Grant, real_time_priority
-from canwall.cycle.state import fade_in, fade_over, set_delay, set_limits, set_wall, start_at
+from canwall.cycle.state import fade_in, fade_over, set_limits, set_wall, start_at
 from canwall.cycle.trip_text import latest_emergency, shown_state, trip_text
 from canwall.cycle.trips import Trip
 from canwall.drive import (
@@ -87,6 +88,7 @@ def run_loop(
     progress: Callable[[int], None] = lambda j: None,
     prepared: AbstractContextManager[dict[str, Grant]] | None = None,
     outcome: Outcome | None = None,
+    experiments: Sequence[Experiment] = (),
 ) -> Outcome:
     """Enable the drives, render the walls, disable the drives.
 
@@ -100,13 +102,14 @@ def run_loop(
         progress: Called with the cycle about every 100 ms of bus time, by the same thread.
         prepared: Entered by the thread of the loop: the preparation of the machine.
         outcome: Filled with the outcome, which is there even if an exception is raised.
+        experiments: Made in place of the walls.
 
     Raises:
         BaseException: A failure of the program itself, or KeyboardInterrupt if the caller does not
             hold signals, once the drives have been taken down.
     """
     outcome = Outcome() if outcome is None else outcome
-    loop = Loop(exchange, stop, progress)
+    loop = Loop(exchange, stop, progress, experiments)
     supervisor = _Supervisor(loop)
     # A collection would stop the cycle for milliseconds; the loop creates no reference cycles.
     gc.collect()
@@ -290,6 +293,7 @@ class Loop:
         exchange: Exchange,
         stop: Callable[[], bool] = lambda: False,
         progress: Callable[[int], None] = lambda j: None,
+        experiments: Sequence[Experiment] = (),
     ) -> None:
         self.exchange = exchange
         self._axes = exchange.axes
@@ -301,7 +305,8 @@ class Loop:
         self.is_down = False
         self._period = float(self._axes[0].cycle["period"][0])
         self._progress_every = max(1, round(0.1 / self._period))
-        self._delay_tests = []
+        self._experiments = experiments
+        self._delay_tests: list[Experiment] = []
         if any(axis.measures_delay for axis in self._axes):
             # SciPy's optimizer takes some tenths of a second to load, so load it before any SYNC.
             from canwall.cycle.delay import DelayTest
@@ -410,10 +415,12 @@ class Loop:
     def render(self, cycles: int | None) -> bool:
         """Render the walls for the given cycles; return True if stopped before their end.
 
-        Raises WallGivenUpError at a trip.
+        Experiments, if there are any, take the walls' place. Raises WallGivenUpError at a trip.
         """
-        if self._stops() or self._measure_delays():
+        if self._stops() or self._measure(self._delay_tests) or self._measure(self._experiments):
             return True
+        if self._experiments:
+            return False
         for axis in self._axes:
             # The handle may be inside the wall, so the force fades in.
             fade_in(axis.cycle, round(axis.settings.run.ramp_in_s / self._period))
@@ -443,28 +450,25 @@ class Loop:
                 ends.append(self.j + fading)
         return max(1, min(ends) - self.j)
 
-    def _measure_delays(self) -> bool:
-        """Measure the delay of the axes that need it; return True if stopped before the end."""
-        tests = self._delay_tests
-        if not tests:
+    def _measure(self, experiments: Sequence[Experiment]) -> bool:
+        """Make experiments together; return True if stopped before the end."""
+        if not experiments:
             return False
         self._enter(Phase.MEASURING)
-        for _ in range(max(test.cycles for test in tests)):
-            if self._stops():
-                return True
-            for test in tests:
-                test.excite()
-            self.exchange.cycle()
-            self._check()
-            for test in tests:
-                test.note()
-        for test in tests:
-            try:
-                axis = test.axis
-                axis.delay = test.delay()
-                set_delay(axis.cycle, axis.settings, axis.delay)
-            except ValueError as error:
-                raise WallGivenUpError(self._say(test.axis, str(error))) from None
+        try:
+            while running := [each for each in experiments if each.excite()]:
+                if self._stops():
+                    return True
+                self.exchange.cycle()
+                self._check()
+                for experiment in running:
+                    experiment.note()
+                if self.j % self._progress_every == 0:
+                    self._progress(self.j)
+            for experiment in experiments:
+                experiment.conclude()
+        except ExperimentError as error:
+            raise WallGivenUpError(self._say(error.axis, str(error))) from None
         return False
 
     def _check(self) -> None:

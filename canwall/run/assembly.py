@@ -10,6 +10,7 @@ from canwall.config import ConfigError, Settings
 from canwall.cycle import (
     BusMonitor,
     Exchange,
+    Experiment,
     Grant,
     Outcome,
     SocketTransport,
@@ -112,6 +113,7 @@ def render(
     stop: Callable[[], bool],
     progress: Callable[[float], None] = lambda now_s: None,
     outcome: Outcome | None = None,
+    experiments: Sequence[Experiment] = (),
 ) -> Outcome:
     """Enable the drives, render the walls for `[run] duration_s` or until stopped, disable them.
 
@@ -120,6 +122,7 @@ def render(
         stop: Asked in the thread of the loop whether to end the walls.
         progress: Called there with the bus time [s] about every 100 ms of it.
         outcome: Filled with the outcome, which is there even if an exception is raised.
+        experiments: Made in place of the walls.
     """
     settings = exchange.axes[0].settings
     period, end_s = settings.bus.cycle_s, settings.run.duration_s
@@ -131,6 +134,7 @@ def render(
         lambda j: progress(j * period),
         _prepared_machine(settings),
         outcome,
+        experiments,
     )
 
 
