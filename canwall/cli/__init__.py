@@ -6,7 +6,7 @@ they share.
 
 from typing import NoReturn
 
-from canwall.cli import bench, run, study, sweep, workbench
+from canwall.cli import bench, identify, run, study, sweep, workbench
 from canwall.cli.ending import INTERRUPTED, guarded
 from canwall.cli.program import make_program, run_program
 
@@ -21,6 +21,7 @@ for command in (
     run.drive,
     bench.doctor,
     bench.latency,
+    identify.identify,
     sweep.sweep,
     sweep.plot,
     workbench.ball,

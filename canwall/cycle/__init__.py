@@ -3,6 +3,7 @@
 from canwall.cycle.axis import Offer, WallAxis, WallStage
 from canwall.cycle.bus_monitor import BusMonitor
 from canwall.cycle.exchange import Exchange, SyncLostError
+from canwall.cycle.experiment import Experiment, ExperimentError
 from canwall.cycle.laws import named_law, run_laws, with_law
 from canwall.cycle.loop import Loop, WallGivenUpError
 from canwall.cycle.machine import real_time_machine
@@ -23,6 +24,8 @@ __all__ = [
     "BusMonitor",
     "CycleFrames",
     "Exchange",
+    "Experiment",
+    "ExperimentError",
     "Grant",
     "Loop",
     "Offer",

@@ -16,6 +16,8 @@ from scipy.optimize import least_squares
 from canwall.compiled import Record, compiled
 from canwall.config import Mechanics
 from canwall.cycle.axis import WallAxis
+from canwall.cycle.experiment import ExperimentError
+from canwall.cycle.state import set_delay
 from canwall.physics import advance, make_plant
 from canwall.walls import MAX_DELAY
 
@@ -49,10 +51,11 @@ class DelayTest:
         self._positions: list[float] = []
         self._forces: list[float] = []
 
-    def excite(self) -> None:
-        """Set the torque of the next cycle."""
+    def excite(self) -> bool:
+        """Set the torque of the next cycle; return False at the end."""
         k = len(self._positions)
         self.axis.cycle["test_per_mille"] = self._torques[k] if k < self.cycles else 0
+        return k < self.cycles
 
     def note(self) -> None:
         """Store position and torque of the last cycle."""
@@ -60,15 +63,20 @@ class DelayTest:
         self._positions.append(float(row["position_rad"]) if row["received"] else math.nan)
         self._forces.append(float(row["torque_cmd"]))
 
-    def delay(self) -> float:
-        """Return D in periods. Raises ValueError if the torques do not explain the motion."""
-        settings = self.axis.settings
-        return measured_delay(
-            np.array(self._positions),
-            np.array(self._forces),
-            settings.bus.cycle_s,
-            settings.mechanics,
-        )
+    def conclude(self) -> None:
+        """Set D of the axis. Raises ExperimentError if the torques do not explain the motion."""
+        axis = self.axis
+        settings = axis.settings
+        try:
+            axis.delay = measured_delay(
+                np.array(self._positions),
+                np.array(self._forces),
+                settings.bus.cycle_s,
+                settings.mechanics,
+            )
+            set_delay(axis.cycle, settings, axis.delay)
+        except ValueError as error:
+            raise ExperimentError(axis, str(error)) from None
 
 
 def excitation(cycles: int, length: int) -> NDArray[np.int64]:

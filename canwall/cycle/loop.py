@@ -8,7 +8,8 @@ from contextlib import suppress
 
 from canwall.cycle.axis import WallAxis, WallStage
 from canwall.cycle.exchange import Exchange
-from canwall.cycle.state import fade_in, fade_over, set_delay, set_limits, set_wall, start_at
+from canwall.cycle.experiment import Experiment, ExperimentError
+from canwall.cycle.state import fade_in, fade_over, set_limits, set_wall, start_at
 from canwall.cycle.trip_text import latest_emergency, shown_state, trip_text
 from canwall.cycle.trips import Trip
 from canwall.drive import (
@@ -62,7 +63,7 @@ class Loop:
         self.is_down = False
         self._period = float(self._axes[0].cycle["period"][0])
         self._progress_every = max(1, round(0.1 / self._period))
-        self._delay_tests = []
+        self._delay_tests: list[Experiment] = []
         if any(axis.measures_delay for axis in self._axes):
             # SciPy's optimizer takes some tenths of a second to load, so load it before any SYNC.
             from canwall.cycle.delay import DelayTest
@@ -176,7 +177,7 @@ class Loop:
 
         Raises WallGivenUpError at a trip.
         """
-        if self._measure_delays():
+        if self.measure(self._delay_tests):
             return True
         for axis in self._axes:
             # The handle may be inside the wall, so the force fades in.
@@ -207,28 +208,28 @@ class Loop:
                 ends.append(self.j + fading)
         return max(1, min(ends) - self.j)
 
-    def _measure_delays(self) -> bool:
-        """Measure the delay of the axes that need it; return True if stopped before the end."""
-        tests = self._delay_tests
-        if not tests:
+    def measure(self, experiments: Sequence[Experiment]) -> bool:
+        """Make experiments together; return True if stopped before the end.
+
+        Raises WallGivenUpError at a trip, and where an experiment cannot go on.
+        """
+        if not experiments:
             return False
         self._enter(Phase.MEASURING)
-        for _ in range(max(test.cycles for test in tests)):
-            if self.stops():
-                return True
-            for test in tests:
-                test.excite()
-            self.exchange.cycle()
-            self._check()
-            for test in tests:
-                test.note()
-        for test in tests:
-            try:
-                axis = test.axis
-                axis.delay = test.delay()
-                set_delay(axis.cycle, axis.settings, axis.delay)
-            except ValueError as error:
-                raise WallGivenUpError(self._say(test.axis, str(error))) from None
+        try:
+            while running := [each for each in experiments if each.excite()]:
+                if self.stops():
+                    return True
+                self.exchange.cycle()
+                self._check()
+                for experiment in running:
+                    experiment.note()
+                if self.j % self._progress_every == 0:
+                    self._progress(self.j)
+            for experiment in experiments:
+                experiment.conclude()
+        except ExperimentError as error:
+            raise WallGivenUpError(self._say(error.axis, str(error))) from None
         return False
 
     def _check(self) -> None:

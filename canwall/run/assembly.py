@@ -10,7 +10,9 @@ from canwall.config import ConfigError, Settings
 from canwall.cycle import (
     BusMonitor,
     Exchange,
+    Experiment,
     Grant,
+    Loop,
     Outcome,
     SocketTransport,
     WallAxis,
@@ -112,6 +114,7 @@ def render(
     stop: Callable[[], bool],
     progress: Callable[[float], None] = lambda now_s: None,
     outcome: Outcome | None = None,
+    experiments: Sequence[Experiment] = (),
 ) -> Outcome:
     """Enable the drives, render the walls for `[run] duration_s` or until stopped, disable them.
 
@@ -120,13 +123,18 @@ def render(
         stop: Asked in the thread of the loop whether to end the walls.
         progress: Called there with the bus time [s] about every 100 ms of it.
         outcome: Filled with the outcome, which is there even if an exception is raised.
+        experiments: Made in place of the walls.
     """
     settings = exchange.axes[0].settings
     period, end_s = settings.bus.cycle_s, settings.run.duration_s
     cycles = None if end_s is None else round(end_s / period)
+
+    def work(loop: Loop) -> bool:
+        return loop.measure(experiments) if experiments else loop.render(cycles)
+
     return run_loop(
         exchange,
-        lambda loop: loop.render(cycles),
+        work,
         stop,
         lambda j: progress(j * period),
         _prepared_machine(settings),

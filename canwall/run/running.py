@@ -8,7 +8,7 @@ from contextlib import closing
 from pathlib import Path
 
 from canwall.config import ConfigError, Settings
-from canwall.cycle import Exchange, Outcome, WallGivenUpError, run_laws
+from canwall.cycle import Exchange, Experiment, Outcome, WallAxis, WallGivenUpError, run_laws
 from canwall.errors import InputError, RunFailedError
 from canwall.record import Recorder, RunFolder, start_recorders
 from canwall.run.assembly import (
@@ -31,6 +31,7 @@ def run(
     report: Callable[[str], None] = lambda what: None,
     progress: Callable[[float, float | None], None] = lambda now_s, end_s: None,
     stopped: Callable[[], bool] = lambda: False,
+    experiment: Callable[[WallAxis], Experiment] | None = None,
 ) -> RunResult:
     """Enable the drive, render the wall, record, summarise, draw (`canwall run`).
 
@@ -40,6 +41,7 @@ def run(
         report: Called with each step.
         progress: Called with the bus time done and its end [s], None without an end.
         stopped: Asked whether to end the run, in addition to signals.
+        experiment: Makes the experiment that takes the wall's place, if there is one.
 
     Returns:
         The result; a trip is part of its outcome.
@@ -52,7 +54,9 @@ def run(
         Exception: A failure of the program itself, once the record is complete.
     """
     with stop_on_signals(held=False), start_recorders(1) as recorders:
-        (result,) = run_together([settings], recorders, output, report, progress, stopped)
+        (result,) = run_together(
+            [settings], recorders, output, report, progress, stopped, experiment
+        )
     if result.outcome.error is not None:
         raise result.outcome.error
     return result
@@ -65,6 +69,7 @@ def run_together(
     report: Callable[[str], None] = lambda what: None,
     progress: Callable[[float, float | None], None] = lambda now_s, end_s: None,
     stopped: Callable[[], bool] = lambda: False,
+    experiment: Callable[[WallAxis], Experiment] | None = None,
 ) -> list[RunResult]:
     """Call `run` for several drives on one bus, each with its wall, on one SYNC.
 
@@ -99,7 +104,8 @@ def run_together(
                             axes.append(make_axis(link, settings, dictionary, known, recorder.ring))
                         exchange = make_exchange(link, axes)
                         monitor = make_monitor(link, axes)
-                        report("rendering")
+                        experiments = [experiment(axis) for axis in axes] if experiment else []
+                        report("measuring" if experiments else "rendering")
                         with closing(exchange), open_to_changes(axes, folders):
                             stop.hold()
                             _render(
@@ -107,6 +113,7 @@ def run_together(
                                 lambda: _recorded(recorders) and (stop() or stopped()),
                                 progress,
                                 outcome,
+                                experiments,
                             )
                 finally:
                     notes = [recorder.close() for recorder in recorders]
@@ -137,6 +144,7 @@ def _render(
     stop: Callable[[], bool],
     progress: Callable[[float, float | None], None],
     outcome: Outcome,
+    experiments: Sequence[Experiment],
 ) -> None:
     """Render the walls; a failure of the program itself is in the outcome."""
     end_s = exchange.axes[0].settings.run.duration_s
@@ -146,6 +154,7 @@ def _render(
             stop,
             lambda now_s: progress(now_s, end_s),
             outcome,
+            experiments,
         )
     except Exception as error:
         outcome.error = outcome.error or error

@@ -1,0 +1,66 @@
+"""Command that finds out what a servo and its operator are like: `identify`."""
+
+import gc
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from canwall.cli.ending import FAILED, INTERRUPTED
+from canwall.cli.options import (
+    ConfigArgument,
+    EdsOption,
+    NoWatchdogOption,
+    absolute_path,
+    settings_from,
+)
+from canwall.cli.output import ProgressDisplay, console, say
+from canwall.stopping import stop_on_signals
+
+
+def identify(
+    config_file: ConfigArgument = None,
+    hand: Annotated[
+        bool, typer.Option("--hand", help="Somebody holds the handle, and is what is identified.")
+    ] = False,
+    inertia: Annotated[
+        float | None,
+        typer.Option(min=1e-9, help="True inertia [kg·m²], for the scale of the torque constant."),
+    ] = None,
+    output: Annotated[Path | None, typer.Option(help="Folder of the record and report.")] = None,
+    eds: EdsOption = None,
+    accept_no_watchdog: NoWatchdogOption = False,
+) -> int:
+    """Measure inertia, friction, cogging, delay, current loop and shaft of the free handle.
+
+    The handle moves to and fro within the limits of CONFIG for about 40 s: keep clear of it.
+    Ctrl-C ends it at any time. With --hand hold the handle still for 12 s.
+    """
+    settings = settings_from(
+        config_file,
+        drive__eds=absolute_path(eds),
+        drive__accept_no_watchdog=accept_no_watchdog or None,
+    )
+    with stop_on_signals(held=False) as stop:
+        with ProgressDisplay() as display:
+            from canwall.identify import identify as measure
+            from canwall.identify import report_lines, toml_fragment, write_report
+
+            gc.freeze()  # modules stay; the collector need not visit them
+            found = measure(settings, output, hand, display.report, display.advance)
+        result = found.result
+        for trip in result.outcome.trips:
+            say(trip)
+        told = found.servo is not None or found.hand is not None
+        if told:
+            for line in report_lines(found, settings, inertia):
+                console.print(line, soft_wrap=True, highlight=False, markup=False)
+            if fragment := toml_fragment(found):
+                console.print(f"\n{fragment}", soft_wrap=True, highlight=False, markup=False)
+            write_report(found, settings, inertia)
+        console.print(f"record: {result.folder.path}", soft_wrap=True, highlight=False)
+        for remark in (*result.remarks, *result.not_restored, *result.notes):
+            say(remark)
+        if result.outcome.interrupted or stop():
+            return INTERRUPTED
+        return 0 if told else FAILED

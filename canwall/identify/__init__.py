@@ -1,0 +1,21 @@
+"""Identification of a servo, and of the operator who holds its handle, from their motion."""
+
+from canwall.identify.fit import Estimate, ServoFit, Shaft, UntellingDataError, fit_servo
+from canwall.identify.hand import HandFit, fit_hand
+from canwall.identify.report import report_lines, toml_fragment, write_report
+from canwall.identify.session import Identified, identify
+
+__all__ = [
+    "Estimate",
+    "HandFit",
+    "Identified",
+    "ServoFit",
+    "Shaft",
+    "UntellingDataError",
+    "fit_hand",
+    "fit_servo",
+    "identify",
+    "report_lines",
+    "toml_fragment",
+    "write_report",
+]

@@ -1,0 +1,249 @@
+"""Torques that excite a servo: slow ramps at rest, and sweeps both ways with a signal on top.
+
+The handle follows a reference, so that it stays within its travel and below a speed; the gains
+are low, and need the inertia of the configuration only roughly. On top come pairs of opposite
+torques of random sign, and multisines; both leave no lasting speed.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canwall.config import ConfigError, Settings
+from canwall.identify.fit import UntellingDataError
+
+Array = NDArray[np.float64]
+
+#: The torques are random but the same every time.
+_SEED = 402
+#: Share of what the limits allow that is used: of travel, speed and torque.
+_TRAVEL, _SPEED, _TORQUE = 0.8, 0.5, 0.5
+#: Natural frequency of the loop around the reference [rad/s], and its damping ratio.
+_OMEGA, _DAMPING_RATIO = 25.0, 0.7
+#: Acceleration of the reference [speed per second], and time of the fastest sweep [s].
+_REVERSAL_S, _FASTEST_SWEEP_S = 0.15, 0.25
+#: Speeds of the sweeps as parts of the largest one, and seconds for each.
+_SWEEPS = ((1.0, 10.0), (0.5, 9.0), (0.2, 8.0), (0.07, 6.0))
+#: Change of the speed by the signal on top, as a part of that of the sweep.
+_RIPPLE = 0.3
+#: Duration of a ramp, of the rest before it, and their number [s].
+_RAMP_S, _REST_S, _RAMPS = 0.35, 0.15, 16
+#: Travel beyond which a handle is not where the reference wants it, as a part of the limits.
+_ASTRAY = 0.95
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Bounds of the excitation around the first position [rad, rad/s, N·m]."""
+
+    travel_rad: float
+    speed_rad_s: float
+    torque_nm: float
+
+    @classmethod
+    def of(cls, settings: Settings, position: float, torque_nm: float) -> "Bounds":
+        """Return the bounds at a position, for a drive that gives at most `torque_nm`.
+
+        Raises ConfigError if the position is too near to a limit.
+        """
+        limits = settings.limits
+        low, high = limits.position_rad
+        room = min(position - low, high - position)
+        if room <= 0.1 * (high - low):
+            raise ConfigError(
+                f"limits.position_rad: the handle is at {position:.3g} rad, too near to a limit "
+                f"to be moved both ways; bring it to the middle of [{low:g}, {high:g}]"
+            )
+        travel = _TRAVEL * room
+        torque = _TORQUE * min(limits.torque_nm, torque_nm)
+        # The reference has to be able to turn round within the travel.
+        inertia = settings.mechanics.inertia_kg_m2
+        fastest = min(
+            _SPEED * limits.speed_rad_s,
+            2.0 * travel / _FASTEST_SWEEP_S,
+            0.5 * torque / inertia * _REVERSAL_S,
+        )
+        return cls(travel, fastest, torque)
+
+
+class Excitation:
+    """Torques for one axis, cycle by cycle; they depend on the positions alone."""
+
+    #: Duration at most [s].
+    duration_s = (
+        _RAMPS * (_RAMP_S + 2.0 * _REST_S) + sum(seconds for _, seconds in _SWEEPS) + 2.0 * _REST_S
+    )
+
+    def __init__(self, settings: Settings, torque_nm: float) -> None:
+        """Prepare the excitation for a drive that gives at most `torque_nm`."""
+        self._settings = settings
+        self._largest = torque_nm
+        self._period = settings.bus.cycle_s
+        self._random = np.random.default_rng(_SEED)
+        self._torques: Iterator[float] | None = None
+        self._position = self._speed = self._moved = 0.0
+        #: Mean square of the change of the speed from cycle to cycle, and the gain against it.
+        self._jolt, self._gain = 0.0, 1.0
+
+    def next(self, position: float) -> float | None:
+        """Return the torque after a position [N·m], None at the end.
+
+        Raises UntellingDataError if the handle is not where it should be, ConfigError at the start
+        if it has no room.
+        """
+        if self._torques is None:
+            self._position, self._start = position, position
+            self.bounds = Bounds.of(self._settings, position, self._largest)
+            self._torques = self._all()
+        else:
+            moved = (position - self._position) / self._period
+            self._jolt += 0.02 * ((moved - self._moved) ** 2 - self._jolt)
+            self._moved = moved
+            # Some smoothing: a coarse encoder has one count in many cycles.
+            self._speed += 0.5 * (moved - self._speed)
+            self._position = position
+        return next(self._torques, None)
+
+    def _all(self) -> Iterator[float]:
+        yield from self._ramps()
+        for part, seconds in _SWEEPS:
+            speed = part * self.bounds.speed_rad_s
+            yield from self._sweep(speed, seconds)
+        yield from self._follow(0.0, 2.0 * _REST_S)
+
+    def _ramps(self) -> Iterator[float]:
+        """Break the handle loose at several places, in both directions."""
+        limit = self.bounds.torque_nm
+        cycles = round(_RAMP_S / self._period)
+        # A quarter of the torque in each ramp; friction of a servo is far below.
+        slope = 0.25 * limit / cycles
+        freed = 3.0 * 2.0 * math.pi / 4096.0
+        for k in range(_RAMPS):
+            yield from self._zero(_REST_S)
+            direction = 1.0 if k % 2 == 0 else -1.0
+            rest = self._position
+            for j in range(cycles):
+                if abs(self._position - rest) > freed:
+                    break
+                yield direction * slope * (j + 1)
+            yield 0.0
+            if k + 1 < _RAMPS:
+                # Elsewhere on the cogging's map.
+                target = self._start + self.bounds.travel_rad * 0.2 * float(
+                    self._random.uniform(-1.0, 1.0)
+                )
+                yield from self._go(target)
+        yield 0.0
+
+    def _zero(self, seconds: float) -> Iterator[float]:
+        for _ in range(round(seconds / self._period)):
+            self._watch()
+            yield 0.0
+
+    def _go(self, target: float) -> Iterator[float]:
+        """Move near to a position within _REST_S."""
+        cycles = round(_REST_S / self._period)
+        begin = self._position
+        for j in range(cycles):
+            share = (j + 1) / cycles
+            smooth = share * share * (3.0 - 2.0 * share)
+            slope = 6.0 * share * (1.0 - share) / _REST_S
+            yield self._loop(begin + (target - begin) * smooth, (target - begin) * slope)
+
+    def _follow(self, speed: float, seconds: float) -> Iterator[float]:
+        for _ in range(round(seconds / self._period)):
+            yield self._loop(self._position, speed)
+
+    def _sweep(self, speed: float, seconds: float) -> Iterator[float]:
+        """Sweep to and fro; half of the time under pairs, half under a multisine."""
+        period, travel = self._period, self.bounds.travel_rad
+        cycles = round(seconds / period)
+        on_top = self._signal(cycles, _RIPPLE * speed)
+        rate = speed / _REVERSAL_S
+        reference, moving, direction = self._position, 0.0, 1.0
+        for j in range(cycles):
+            offset = reference - self._start
+            stopping = 0.5 * moving * moving / rate
+            if direction * offset > travel - stopping:
+                direction = -direction
+            moving += min(max(direction * speed - moving, -rate * period), rate * period)
+            reference += moving * period
+            # A shaft may swing, and the inertia be far less than that of the configuration.
+            self._gain *= 0.995 if self._jolt > (_RIPPLE * speed) ** 2 else 1.001
+            self._gain = min(self._gain, 1.0)
+            wanted = self._loop(reference, moving) + self._gain * on_top[j]
+            limit = self.bounds.torque_nm
+            yield min(max(wanted, -limit), limit)
+
+    def _signal(self, cycles: int, ripple: float) -> Array:
+        """Return pairs and a multisine that change the speed by about `ripple`, shape (cycles,)."""
+        most = 0.7 * self.bounds.torque_nm
+        mass = self._settings.mechanics.inertia_kg_m2
+        amplitude = min(ripple * mass / self._period, most)
+        half = cycles // 2
+        signs = self._random.choice([-1.0, 1.0], size=half // 2)
+        pairs = amplitude * np.stack([signs, -signs], axis=1).reshape(-1)
+        # Equal amplitudes up to the Nyquist frequency, random phases, period of about a second.
+        n = cycles - len(pairs)
+        length = min(n, max(64, round(1.0 / self._period)))
+        frequencies = np.fft.rfftfreq(length, self._period)
+        spectrum = np.exp(2j * np.pi * self._random.uniform(size=len(frequencies)))
+        spectrum[frequencies < 0.02 / self._period] = 0.0
+        one = np.fft.irfft(spectrum, length)
+        tones = np.resize(np.clip(amplitude * one / one.std() / 1.5, -most, most), n)
+        return np.concatenate([pairs, tones])
+
+    def _loop(self, position: float, speed: float) -> float:
+        """Return the torque that leads the handle to the reference."""
+        self._watch()
+        mechanics, limit = self._settings.mechanics, self.bounds.torque_nm
+        mass = mechanics.inertia_kg_m2
+        stiffness, damping = mass * _OMEGA**2, 2.0 * _DAMPING_RATIO * mass * _OMEGA
+        friction = mechanics.coulomb_nm * math.copysign(1.0, speed) if speed else 0.0
+        pulled = stiffness * (position - self._position) + damping * (speed - self._speed)
+        return min(max(pulled + friction, -limit), limit)
+
+    def _watch(self) -> None:
+        low, high = self._settings.limits.position_rad
+        middle, half = 0.5 * (low + high), 0.5 * (high - low)
+        if abs(self._position - middle) > _ASTRAY * half:
+            raise UntellingDataError(
+                f"the handle went to {self._position:.3g} rad, next to limits.position_rad: "
+                f"something pushes it, or mechanics.inertia_kg_m2 is far off"
+            )
+        if abs(self._speed) > 0.9 * self._settings.limits.speed_rad_s:
+            raise UntellingDataError(
+                f"the handle went at {self._speed:.3g} rad/s, next to limits.speed_rad_s: "
+                f"something pushes it, or mechanics.inertia_kg_m2 is far too large"
+            )
+
+
+class HandExcitation:
+    """Small torques at a handle that somebody holds: a multisine up to 60 Hz."""
+
+    duration_s = 12.0
+    #: Highest frequency [Hz], and length of a period of the multisine [s].
+    _HIGHEST_HZ, _PERIOD_S = 60.0, 2.0
+
+    def __init__(self, settings: Settings, torque_nm: float) -> None:
+        """Prepare the excitation for a drive that gives at most `torque_nm`."""
+        period = settings.bus.cycle_s
+        length = round(self._PERIOD_S / period)
+        spectrum = np.zeros(length // 2 + 1, complex)
+        highest = min(round(self._HIGHEST_HZ * self._PERIOD_S), len(spectrum) - 1)
+        phases = np.random.default_rng(_SEED).uniform(size=highest)
+        spectrum[1 : highest + 1] = np.exp(2j * np.pi * phases)
+        one = np.fft.irfft(spectrum, length)
+        amplitude = min(
+            settings.estimator.measure_torque_nm,
+            _TORQUE * min(settings.limits.torque_nm, torque_nm),
+        )
+        torques = np.clip(0.5 * amplitude * one / one.std(), -amplitude, amplitude)
+        self._torques = iter(np.resize(torques, round(self.duration_s / period)).tolist())
+
+    def next(self, position: float) -> float | None:
+        """Return the torque of the next cycle [N·m], None at the end."""
+        return next(self._torques, None)

@@ -1,0 +1,628 @@
+"""Fit of a servo to its motion: pure functions of positions and torques at the SYNCs.
+
+The record is cut into short pieces in which the handle keeps its direction. In a piece friction is
+linear,
+
+    m·ÿ = u_δ − b·ẏ ∓ c± − g(y),
+
+where u_δ is the torque that was commanded, held, delayed by δ and passed through the current loop,
+and g the cogging. Integrated twice, every term but u_δ is a known function of the measured
+positions, and position and velocity at the beginning of each piece are projected out. What remains
+is linear in (1, ρ, b, c₊, c₋, g)/m and non-linear in delay, lag and the resonance of the shaft
+alone, which are found by variable projection. The response to the torque is the exact one.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+from scipy.ndimage import uniform_filter1d
+from scipy.optimize import least_squares
+
+from canwall.compiled import compiled
+from canwall.errors import RunFailedError
+
+Array = NDArray[np.float64]
+
+#: Samples of a piece: long enough for friction to move many counts, short enough for the residuals
+#: of forces outside the model not to add up.
+PIECE = 40
+#: Fewest pieces from which anything is concluded, and fewest in one direction.
+_FEWEST, _FEWEST_ONE_WAY = 60, 15
+#: Distance of two points of the cogging's map [rad], and how large an amplitude may be before the
+#: fit resists, as a part of the largest torque.
+_COG_GRID_RAD, _COG_PRIOR = 0.025, 0.02
+#: Pieces whose residuals are this many times the median are left out: the drive's clock slips by a
+#: tick of its own now and then, and nothing in the model does.
+_OUTLIER = 5.0
+#: Parts of the record whose errors count as independent, and the factor from a standard error to
+#: half a 95 % interval: Student's t with one degree of freedom fewer.
+_BLOCKS, _T_95 = 16, 2.131
+#: Share of the residuals that a shaft has to explain, and its coefficient in standard errors.
+_SHAFT_EXPLAINS, _SHAFT_SIGNIFICANCE = 0.03, 6.0
+#: Largest delay and lag in a fit [periods].
+_MOST_DELAY, _MOST_LAG = 4.0, 3.0
+#: Lags over which the residuals' autocorrelation is reported.
+_CORRELATED = 5
+
+
+class UntellingDataError(RunFailedError):
+    """Data that do not tell what was asked; the text gives the reason."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value and half of its 95 % interval; the half is inf for what the data do not tell."""
+
+    value: float
+    half: float
+
+    @property
+    def low(self) -> float:
+        """Lower end of the interval."""
+        return self.value - self.half
+
+    @property
+    def high(self) -> float:
+        """Upper end of the interval."""
+        return self.value + self.half
+
+    def contains(self, value: float) -> bool:
+        """Return True for a value inside the interval."""
+        return self.low <= value <= self.high
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """What the model leaves of the measured positions.
+
+    Attributes:
+        rms: Root of their mean square [encoder steps]; 0.29 is that of quantisation alone.
+        explained: Share of the motion in the pieces that the model explains.
+        correlation: Autocorrelation at lags 1, 2, …, shape (5,); zero for white residuals.
+        left_out: Share of the pieces that were left out as outliers.
+    """
+
+    rms: float
+    explained: float
+    correlation: Array
+    left_out: float
+
+    @property
+    def white(self) -> bool:
+        """True if the residuals are as small as the encoder's step, or without correlation."""
+        return bool(self.rms < 0.5 or np.abs(self.correlation).max() < 0.2)
+
+
+@dataclass(frozen=True)
+class Shaft:
+    """Resonance of the shaft as the motor shows it: frequency [Hz], damping ratio, load/rotor."""
+
+    hz: Estimate
+    damping_ratio: Estimate
+    ratio: Estimate
+
+
+@dataclass(frozen=True)
+class ServoFit:
+    """A servo in SI units; torques are the commanded ones.
+
+    Attributes:
+        inertia: Of all that moves [kg·m²].
+        viscous: Viscous friction [N·m·s/rad].
+        forward: Coulomb friction, with any constant torque, of motion towards larger positions.
+        backward: The same towards smaller ones.
+        coulomb: Coulomb friction without the constant torque: mean of both.
+        delay: Pure delay from sample to torque [periods], the drive's own cycle included.
+        lag: Time constant of the current loop [s].
+        total: Delay and lag together [periods].
+        shaft: Resonance; None for a shaft that looks rigid.
+        cogging: Map of the cogging torque, shape (2, n): position [rad] and torque [N·m].
+        residuals: What is left.
+        shown: A stretch of the motion, shape (3, n): time [s], measured and model [rad].
+    """
+
+    inertia: Estimate
+    viscous: Estimate
+    forward: Estimate
+    backward: Estimate
+    coulomb: Estimate
+    delay: Estimate
+    lag: Estimate
+    total: Estimate
+    shaft: Shaft | None
+    cogging: Array
+    residuals: Residuals
+    shown: Array
+
+
+def steady_pieces(position: Array, period: float, step: float) -> tuple[NDArray[np.int64], Array]:
+    """Return first samples and directions of the pieces in which the handle does not reverse.
+
+    Args:
+        position: Positions at the SYNCs [rad], NaN where one is missing.
+        period: SYNC period [s].
+        step: Step of the encoder [rad].
+    """
+    moved = np.diff(position)
+    jolts = np.diff(moved)
+    # Between two samples the velocity differs from the mean by less than it changes over them.
+    power = uniform_filter1d(np.nan_to_num(jolts) ** 2, 2 * PIECE, mode="nearest")
+    jolt = np.sqrt(np.maximum(power, 0.0))
+    least = np.maximum(np.append(jolt, jolt[-1]), max(2.0 * step, 0.1 * period))
+    found: list[int] = []
+    signs: list[float] = []
+    for sign in (1.0, -1.0):
+        steady = np.nan_to_num(sign * moved, nan=-1.0) > least
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], steady.astype(int), [0]])))
+        for begin, end in edges.reshape(-1, 2):
+            # `end` moves have one position more.
+            pieces = range(int(begin), int(end) + 2 - PIECE, PIECE)
+            found += pieces
+            signs += [sign] * len(pieces)
+    order = np.argsort(found)
+    return np.array(found, np.int64)[order], np.array(signs)[order]
+
+
+@compiled
+def _respond(first: Array, second: Array, whole: int, torque: Array, response: Array) -> None:
+    """Follow a linear system whose input changes within each period.
+
+    first and second hold Φ and Γ, side by side, of the two parts of a period; row j of `response`
+    gets the position without spring, and the resonance's, at SYNC j.
+    """
+    order = len(first)
+    x, z = np.zeros(order), np.zeros(order)
+    for j in range(len(torque)):
+        response[j, 0] = x[1]
+        response[j, 1] = x[3]
+        before = torque[j - whole - 1] if j > whole else 0.0
+        after = torque[j - whole] if j >= whole else 0.0
+        for i in range(order):
+            z[i] = first[i, order] * before
+            for k in range(order):
+                z[i] += first[i, k] * x[k]
+        for i in range(order):
+            x[i] = second[i, order] * after
+            for k in range(order):
+                x[i] += second[i, k] * z[k]
+
+
+def torque_response(
+    torque: Array, period: float, delay: float, lag: float, hz: float, damping_ratio: float
+) -> Array:
+    """Return the motion of a unit inertia, and of a resonance, under commanded torques.
+
+    Args:
+        torque: Torque commanded after each SYNC [N·m], shape (n,).
+        period: SYNC period [s].
+        delay: From the SYNC until the torque changes [periods].
+        lag: Time constant of the current loop [s].
+        hz: Natural frequency of the resonance q̈ + 2ζω·q̇ + ω²·q = u.
+        damping_ratio: Its ζ.
+
+    Returns:
+        Positions at the SYNCs, shape (n, 2).
+    """
+    omega = 2.0 * math.pi * hz
+    rate = 1.0 / max(lag, 1e-4 * period)
+    # States: torque, position and velocity of the inertia, and of the resonance.
+    a = np.zeros((6, 6))
+    a[0, 0], a[0, 5] = -rate, rate
+    a[1, 2], a[2, 0] = 1.0, 1.0
+    a[3, 4] = 1.0
+    a[4, 0], a[4, 3], a[4, 4] = 1.0, -(omega**2), -2.0 * damping_ratio * omega
+    whole = math.floor(delay)
+    share = delay - whole
+    parts = [expm(a * part * period)[:5] for part in (share, 1.0 - share)]
+    response = np.empty((len(torque), 2))
+    _respond(*(np.ascontiguousarray(part) for part in parts), whole, torque, response)
+    return response
+
+
+class _Pieces:
+    """Regressors of the pieces: integrals of what acts, without what their beginnings explain.
+
+    `ringing` is frequency [Hz] and damping ratio of a shaft: friction that reverses makes it ring.
+    """
+
+    def __init__(
+        self,
+        position: Array,
+        torque: Array,
+        period: float,
+        first: NDArray[np.int64],
+        ringing: tuple[float, float] | None,
+    ) -> None:
+        self.torque, self.period = torque, period
+        self.at = first[:, None] + np.arange(PIECE)
+        self._position = position[self.at]
+        time = np.arange(PIECE) * period
+        of_start = [np.ones(PIECE), time]
+        if ringing is not None:
+            hz, damping_ratio = ringing
+            rate = 2.0 * math.pi * hz * complex(-damping_ratio, math.sqrt(1.0 - damping_ratio**2))
+            swing = np.exp(rate * time)
+            of_start += [swing.real, swing.imag]
+        explained, _ = np.linalg.qr(np.stack(of_start, axis=1))
+        self._without_start = np.eye(PIECE) - explained @ explained.T
+        self.free = PIECE - len(of_start)
+        # Exact for an integrand that is linear between two samples.
+        once = np.tril(np.ones((PIECE, PIECE))) * period
+        once[:, 0] -= 0.5 * period
+        once -= np.eye(PIECE) * 0.5 * period
+        once[0] = 0.0
+        inner = np.zeros((PIECE, PIECE))
+        for i in range(1, PIECE):
+            inner[i] = inner[i - 1] + period * once[i - 1]
+            inner[i, i - 1] += period**2 / 3.0
+            inner[i, i] += period**2 / 6.0
+        self._once, self._twice = self._without_start @ once, self._without_start @ inner
+        self.time = time
+
+    def flat(self, of_pieces: Array) -> Array:
+        """Return what the pieces' beginnings do not explain, one value after another."""
+        return np.asarray(of_pieces @ self._without_start.T).reshape(-1)
+
+    def measured(self) -> Array:
+        return self.flat(self._position - self._position[:, :1])
+
+    def velocity(self) -> Array:
+        """Return the regressor of b/m."""
+        return -np.asarray((self._position - self._position[:, :1]) @ self._once.T).reshape(-1)
+
+    def friction(self, here: NDArray[np.bool_], sign: float) -> Array:
+        """Return the regressor of c/m in the pieces that go one way."""
+        return self.flat(np.where(here[:, None], -0.5 * sign * self.time**2, 0.0))
+
+    def cogging(self, grid: Array) -> Array:
+        """Return the regressors of a torque that is linear between the points of a grid."""
+        columns = np.empty((self.at.size, len(grid)))
+        spacing = grid[1] - grid[0]
+        for k, point in enumerate(grid):
+            hat = np.maximum(1.0 - np.abs(self._position - point) / spacing, 0.0)
+            columns[:, k] = -(hat @ self._twice.T).reshape(-1)
+        return columns
+
+    def driven(self, delay: float, lag: float, hz: float, damping_ratio: float) -> Array:
+        """Return the regressors of 1/m and ρ/m, shape (samples, 2)."""
+        motion = torque_response(self.torque, self.period, delay, lag, hz, damping_ratio)[self.at]
+        return np.stack([self.flat(motion[:, :, k] - motion[:, :1, k]) for k in (0, 1)], axis=1)
+
+
+def fit_servo(position: Array, torque: Array, period: float, step: float) -> ServoFit:
+    """Fit a servo to the motion of its free handle.
+
+    Args:
+        position: Positions at the SYNCs [rad], shape (n,), NaN where one is missing.
+        torque: Torques commanded after each of them [N·m], shape (n,).
+        period: SYNC period [s].
+        step: Step of the encoder [rad].
+
+    Raises:
+        UntellingDataError: If the data do not tell.
+    """
+    first, sign = steady_pieces(position, period, step)
+    _check_amount(first, sign)
+
+    def fit(some: slice | NDArray[np.bool_], ringing: tuple[float, float] | None = None) -> _Fit:
+        return _Fit(position, torque, period, step, first[some], sign[some], ringing)
+
+    # A part of the pieces is enough for first values.
+    part = fit(slice(None, None, 3))
+    x = part.rigid()
+    shaft = part.elastic(x)
+    if shaft is not None:
+        x = shaft
+    ringing = None if shaft is None else (float(x[2]), float(x[3]))
+    whole = fit(slice(None), ringing)
+    x = whole.refined(x)
+    sound = whole.sound(x)
+    if not sound.all():
+        _check_amount(first[sound], sign[sound])
+        whole = fit(sound, ringing)
+        x = whole.refined(x)
+    return whole.result(x, 1.0 - float(np.mean(sound)))
+
+
+def _check_amount(first: NDArray[np.int64], sign: Array) -> None:
+    ways = (int(np.sum(sign > 0.0)), int(np.sum(sign < 0.0)))
+    if len(first) < _FEWEST or min(ways) < _FEWEST_ONE_WAY:
+        raise UntellingDataError(
+            f"the handle moved too little to tell: {ways[0]} stretches of {PIECE} cycles one way, "
+            f"{ways[1]} the other; let it go, or allow more travel, speed or torque"
+        )
+
+
+class _Fit:
+    """Variable projection over delay, lag and resonance."""
+
+    def __init__(
+        self,
+        position: Array,
+        torque: Array,
+        period: float,
+        step: float,
+        first: NDArray[np.int64],
+        sign: Array,
+        ringing: tuple[float, float] | None = None,
+    ) -> None:
+        self._pieces = _Pieces(position, torque, period, first, ringing)
+        self._position, self._period, self._step = position, period, step
+        self._first, self._sign = first, sign
+        pieces = self._pieces
+        self._measured = pieces.measured()
+        seen = position[pieces.at]
+        low, high = float(seen.min()), float(seen.max())
+        points = max(3, math.ceil((high - low) / _COG_GRID_RAD) + 1)
+        self._grid = np.linspace(low, high, points)
+        cogging = pieces.cogging(self._grid)
+        self._friction = np.stack(
+            [
+                pieces.velocity(),
+                pieces.friction(sign > 0.0, 1.0),
+                pieces.friction(sign < 0.0, -1.0),
+            ],
+            axis=1,
+        )
+        # Cogging far above what servos have is resisted, which also settles where its mean goes.
+        rough = np.linalg.lstsq(
+            np.column_stack([pieces.driven(1.0, 0.0, 0.25 / period, 0.5)[:, 0], self._friction]),
+            self._measured,
+            rcond=None,
+        )[0]
+        accelerated = _COG_PRIOR * float(np.abs(torque).max()) * max(float(rough[0]), 0.0)
+        if accelerated == 0.0:
+            raise UntellingDataError(
+                "the handle does not follow the torques: something holds it, or the sign is wrong"
+            )
+        ridge = 0.3 * step / accelerated
+        self._points = points
+        # Cogging first, so that the leading part of the basis is that of the cogging alone.
+        self._cogging = cogging
+        fixed = np.vstack([cogging, ridge * np.eye(points)])
+        fixed = np.column_stack([fixed, self._padded(self._friction)])
+        self._basis, self._triangle = np.linalg.qr(fixed)
+        self._target = self._without(self._basis, self._measured)
+
+    def _padded(self, columns: Array) -> Array:
+        """Append the rows of the cogging's prior."""
+        return np.concatenate([columns, np.zeros((self._points, *columns.shape[1:]))])
+
+    def _without(self, basis: Array, columns: Array) -> Array:
+        """Return columns without what an orthonormal basis explains."""
+        padded = self._padded(columns)
+        return padded - basis @ (basis.T @ padded)
+
+    def _driven(self, x: Array) -> Array:
+        """Return the regressors of 1/m and, with a resonance in x, of ρ/m."""
+        delay, lag, hz, ratio = self._physical(x)
+        driven = self._pieces.driven(delay, lag, hz, ratio)
+        return driven if len(x) > 2 else driven[:, :1]
+
+    def _physical(self, x: Array) -> tuple[float, float, float, float]:
+        """Return delay [periods], lag [s], frequency [Hz] and damping ratio."""
+        total, lag = float(x[0]), abs(float(x[1]))
+        hz, ratio = (float(x[2]), float(x[3])) if len(x) > 2 else (0.25 / self._period, 0.5)
+        return max(total - lag, 0.0), lag * self._period, hz, ratio
+
+    def _solved(self, x: Array) -> tuple[Array, Array]:
+        """Return the parameters of the driven motion, and the residuals [steps]."""
+        columns = self._without(self._basis, self._driven(x))
+        linear = np.linalg.solve(columns.T @ columns, columns.T @ self._target)
+        return linear, (self._target - columns @ linear) / self._step
+
+    def _misses(self, x: Array) -> Array:
+        return self._solved(x)[1]
+
+    def _cost(self, x: Array) -> float:
+        left = self._misses(x)
+        return float(left @ left)
+
+    def refined(self, x: Array) -> Array:
+        """Return the parameters that explain the motion best, from first ones."""
+        low, high = np.zeros(2), np.array([_MOST_DELAY, _MOST_LAG])
+        if len(x) > 2:
+            low = np.array([*low, 0.9 * x[2], 1e-3])
+            high = np.array([*high, 1.1 * x[2], 0.7])
+        inside = np.clip(x, low + 1e-3, high - 1e-3)
+        found = least_squares(
+            self._misses,
+            inside,
+            bounds=(low, high),
+            x_scale=np.maximum(np.abs(inside), 0.05),
+            diff_step=1e-4,
+            xtol=1e-7,
+            max_nfev=20,
+        )
+        return np.asarray(found.x)
+
+    def rigid(self) -> Array:
+        """Return delay plus lag, and lag [periods], of a rigid shaft."""
+        guesses = [np.array([total, min(0.1, 0.5 * total)]) for total in np.arange(0.1, 4.1, 0.25)]
+        best = min(guesses, key=self._cost)
+        return self.refined(best)
+
+    def sound(self, x: Array) -> NDArray[np.bool_]:
+        """Return which pieces are no outliers."""
+        left = self._misses(x)[: self._measured.size].reshape(-1, PIECE)
+        sizes = np.sqrt(np.mean(left**2, axis=1))
+        return np.asarray(sizes <= max(_OUTLIER * float(np.median(sizes)), 1.0))
+
+    def elastic(self, rigid: Array) -> Array | None:
+        """Return the parameters with a resonance, None if the shaft looks rigid."""
+        nyquist = 0.5 / self._period
+        before = self._cost(rigid)
+        lag = min(rigid[1], 0.15)
+        guesses = [
+            np.array([max(rigid[0] - late, 0.05), lag, hz, 0.03])
+            for hz in np.geomspace(0.08 * nyquist, 1.6 * nyquist, 40)
+            for late in (0.0, 0.15)
+        ]
+        best = min(guesses, key=self._cost)
+        if self._cost(best) > (1.0 - _SHAFT_EXPLAINS) * before:
+            return None
+        x = self.refined(best)
+        linear, covariance, _ = self._everything(x)
+        ratio = linear[1] / linear[0]
+        significant = linear[1] > _SHAFT_SIGNIFICANCE * math.sqrt(covariance[5, 5])
+        explains = self._cost(x) < (1.0 - _SHAFT_EXPLAINS) * before
+        return x if ratio > 0.0 and significant and explains else None
+
+    def _everything(self, x: Array) -> tuple[Array, Array, Array]:
+        """Return linear parameters, covariance of (non-linear, linear) ones, residuals [steps].
+
+        The linear ones are (1, ρ, b, c₊, c₋)/m, without ρ for a rigid shaft. Residuals may be
+        correlated in any way within each of _BLOCKS parts of the record, which differ in speed and
+        signal (a cluster-robust estimate, Liang and Zeger 1986).
+        """
+        basis = self._basis[:, : self._points]
+        columns = np.column_stack([self._driven(x), self._friction])
+        reduced = self._without(basis, columns)
+        target = self._without(basis, self._measured)
+        linear = np.linalg.lstsq(reduced, target, rcond=None)[0]
+        left = (target - reduced @ linear) / self._step
+        slopes = []
+        for i in range(len(x)):
+            h = max(1e-4 * abs(x[i]), 1e-5)
+            up, down = x.copy(), x.copy()
+            up[i] += h
+            down[i] -= h
+            change = self._driven(up) - self._driven(down)
+            slopes.append(self._without(basis, change @ linear[: change.shape[1]] / (2.0 * h)))
+        jacobian = np.column_stack([*slopes, reduced]) / self._step
+        scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+        jacobian /= scale
+        bread = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-13, hermitian=True)
+        samples = self._measured.size
+        scores = (jacobian[:samples] * left[:samples, None]).reshape(-1, PIECE, jacobian.shape[1])
+        blocks = np.array_split(scores.sum(axis=1), _BLOCKS)
+        sums = np.stack([block.sum(axis=0) for block in blocks])
+        meat = sums.T @ sums * _BLOCKS / (_BLOCKS - 1.0)
+        covariance = bread @ meat @ bread
+        return linear, covariance / np.outer(scale, scale), left[:samples]
+
+    def result(self, x: Array, left_out: float) -> ServoFit:
+        """Return the fit in physical units."""
+        linear, covariance, left = self._everything(x)
+        if linear[0] <= 0.0:
+            raise UntellingDataError(
+                "the handle accelerates against the torques: something else drives it"
+            )
+        everything = np.concatenate([x, linear])
+        n = len(x)
+        at = n + (2 if n > 2 else 1)
+        cogging, constant = self._map(x, linear)
+
+        def estimate(
+            of: Callable[[Array], float], unmodelled: float, least: float = 0.0
+        ) -> Estimate:
+            """Return a function of the parameters; errors of the model are relative or absolute."""
+            slope = np.empty(len(everything))
+            for i, value in enumerate(everything):
+                h = max(abs(value) * 1e-6, 1e-12)
+                up, down = everything.copy(), everything.copy()
+                up[i], down[i] = value + h, value - h
+                slope[i] = (of(up) - of(down)) / (2.0 * h)
+            value = of(everything)
+            statistical = _T_95 * math.sqrt(max(float(slope @ covariance @ slope), 0.0))
+            return Estimate(value, math.hypot(statistical, unmodelled * value, least))
+
+        shaft = None
+        if n > 2:
+            shaft = Shaft(
+                estimate(lambda p: float(p[2]), 0.005),
+                estimate(lambda p: float(p[3]), 0.1),
+                estimate(lambda p: float(p[n + 1] / p[n]), 0.02),
+            )
+        force = 1e-4 * float(np.abs(self._pieces.torque).max())
+        one_way = math.hypot(force, 0.03 * float(np.ptp(cogging[1])))
+        return ServoFit(
+            estimate(lambda p: 1.0 / float(p[n]), 0.002),
+            estimate(lambda p: float(p[at] / p[n]), 0.02),
+            estimate(lambda p: float(p[at + 1] / p[n]) + constant, 0.005, one_way),
+            estimate(lambda p: float(p[at + 2] / p[n]) - constant, 0.005, one_way),
+            estimate(lambda p: 0.5 * float((p[at + 1] + p[at + 2]) / p[n]), 0.005, force),
+            estimate(lambda p: float(p[0] - p[1]), 0.0, 0.005),
+            estimate(lambda p: float(p[1]) * self._period, 0.03, 0.002 * self._period),
+            estimate(lambda p: float(p[0]), 0.0, 0.003),
+            shaft,
+            cogging,
+            self._residuals(left, left_out),
+            self._shown(left),
+        )
+
+    def _map(self, x: Array, linear: Array) -> tuple[Array, float]:
+        """Return the map without its mean, and the mean, which is a constant torque [N·m]."""
+        driven = self._driven(x)
+        rest = self._padded(self._measured - driven @ linear[: driven.shape[1]])
+        solved = np.linalg.solve(self._triangle, self._basis.T @ rest)
+        torque = solved[: self._points] / linear[0]
+        # What was hardly visited is not known.
+        weight = np.sum(self._cogging**2, axis=0)
+        known = weight > 0.2 * float(np.median(weight))
+        place, torque = self._grid[known], torque[known]
+        # A Hann window: the map ends within a cog.
+        window = np.hanning(len(torque) + 2)[1:-1]
+        mean = float(np.average(torque, weights=window))
+        return np.stack([place, torque - mean]), mean
+
+    def _residuals(self, left: Array, left_out: float) -> Residuals:
+        by_piece = left.reshape(-1, PIECE)
+        power = float(np.mean(left**2))
+        # Degrees of freedom went into the beginnings.
+        rms = math.sqrt(power * PIECE / self._pieces.free)
+        correlation = np.array(
+            [
+                float(np.mean(by_piece[:, lag:] * by_piece[:, :-lag])) / max(power, 1e-30)
+                for lag in range(1, _CORRELATED + 1)
+            ]
+        )
+        whole = float(np.mean((self._measured / self._step) ** 2))
+        return Residuals(rms, 1.0 - power / whole, correlation, left_out)
+
+    def _shown(self, left: Array) -> Array:
+        """Return the longest stretch without a gap, at most some tenths of a second."""
+        follows = np.diff(self._first) == PIECE
+        best = begin = 0
+        longest = 0
+        for k in range(len(self._first)):
+            if k and not follows[k - 1]:
+                begin = k
+            if k - begin + 1 > longest:
+                best, longest = begin, k - begin + 1
+        some = slice(best, best + min(longest, 8))
+        at = self._pieces.at[some].reshape(-1)
+        measured = self._position[at]
+        model = measured - left.reshape(-1, PIECE)[some].reshape(-1) * self._step
+        return np.stack([at * self._period, measured, model])
+
+
+def break_away(position: Array, torque: Array, step: float) -> tuple[Array, Array]:
+    """Return where and at which torque a handle at rest broke loose, in a record of slow ramps.
+
+    Each ramp begins at zero torque. Both results have the same shape; the sign of a torque is its
+    direction.
+
+    Args:
+        position: Positions at the SYNCs [rad].
+        torque: Torques commanded after them [N·m].
+        step: Step of the encoder [rad].
+    """
+    places, torques = [], []
+    starts = np.flatnonzero((torque[1:] != 0.0) & (torque[:-1] == 0.0))
+    for start, end in zip(starts, [*starts[1:], len(torque)], strict=True):
+        rest = position[start]
+        moved = np.flatnonzero(np.abs(position[start:end] - rest) > 3.0 * step)
+        if len(moved) and torque[start + moved[0] - 1] != 0.0:
+            places.append(rest)
+            torques.append(torque[start + moved[0] - 1])
+    return np.array(places), np.array(torques)
+
+
+def encoder_step(counts: NDArray[np.int64]) -> int:
+    """Return the greatest common divisor of all changes of the position [counts]."""
+    return int(np.gcd.reduce(np.abs(np.diff(counts)))) or 1

@@ -1,0 +1,270 @@
+"""Report of an identification: lines of text, a fragment of TOML, JSON, a picture."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from canwall.config import Settings
+from canwall.figure_style import COLOURS, STYLE
+from canwall.identify.fit import Estimate, ServoFit
+from canwall.identify.hand import HandFit
+from canwall.identify.session import Identified, Measured
+from canwall.record import RecordError
+
+Array = NDArray[np.float64]
+
+#: Deviation of the inertia or of 0x6077 that is said to be one.
+_DEVIATES = 0.1
+#: Part of the cycle above which delay and lag of the drive cost stiffness and are called slow.
+_SLOW = 0.15
+
+
+def report_lines(found: Identified, settings: Settings, inertia: float | None = None) -> list[str]:
+    """Return what was found, a line for each quantity with its 95 % interval.
+
+    `inertia` is the true one [kg·m²], if it is known: it gives the scale of the torque constant.
+    """
+    if found.hand is not None:
+        return _hand_lines(found.hand)
+    assert found.servo is not None
+    servo, measured = found.servo, found.measured
+    lines = [
+        _line("inertia", servo.inertia, "kg·m²"),
+        _line("viscous friction", servo.viscous, "N·m·s/rad"),
+        _line("Coulomb friction", servo.coulomb, "N·m"),
+        _line("  forwards", servo.forward, "N·m"),
+        _line("  backwards", servo.backward, "N·m"),
+        _stiction_line(found),
+        _cogging_line(servo),
+        _line("delay and lag", servo.total, "cycles"),
+        _line("  delay", servo.delay, "cycles, the drive's own cycle included"),
+        _line("  lag of the current loop", servo.lag, f"s, {_bandwidth_text(servo)}"),
+    ]
+    if servo.shaft is None:
+        lines.append("shaft: rigid as far as the data tell")
+    else:
+        lines += [
+            _line("resonance of the shaft", servo.shaft.hz, "Hz"),
+            _line("  damping ratio", servo.shaft.damping_ratio, ""),
+            _line("  inertia of load/rotor", servo.shaft.ratio, ""),
+        ]
+    residuals = servo.residuals
+    correlation = ", ".join(f"{value:+.2f}" for value in residuals.correlation)
+    lines += [
+        f"encoder: step {measured.step:.3g} rad",
+        f"residuals: {residuals.rms:.2f} steps r.m.s. (0.29: quantisation alone), "
+        f"{'white' if residuals.white else 'not white: the intervals allow for it'}; "
+        f"autocorrelation {correlation}; {residuals.explained:.4%} explained; "
+        f"{residuals.left_out:.1%} of the data left out",
+    ]
+    return lines + remarks(found, settings, inertia)
+
+
+def remarks(found: Identified, settings: Settings, inertia: float | None = None) -> list[str]:
+    """Return what is out of the ordinary."""
+    servo, said = found.servo, []
+    assert servo is not None
+    if inertia is not None:
+        scale = Estimate(
+            inertia / servo.inertia.value, inertia * servo.inertia.half / servo.inertia.value**2
+        )
+        said.append(_line("torque constant, true/assumed", scale, ""))
+        if abs(scale.value - 1.0) > max(_DEVIATES, scale.half):
+            said.append(
+                f"the torque is {scale.value:.2f} times the commanded one: look to the rated "
+                f"torque (0x6076, drive.rated_torque_nm); until then the values here, in commanded "
+                f"torque, are right for the laws"
+            )
+    else:
+        ratio = servo.inertia.value / settings.mechanics.inertia_kg_m2
+        if abs(ratio - 1.0) > _DEVIATES:
+            said.append(
+                f"the inertia is {ratio:.2f} times that of [mechanics]: if that one is known well, "
+                f"the torque constant is off by {1.0 / ratio:.2f}; --inertia tells"
+            )
+    gain = torque_actual_gain(found.measured, servo)
+    if gain is not None and abs(gain - 1.0) > _DEVIATES:
+        said.append(f"0x6077 shows {gain:.2f} times the commanded torque")
+    own = servo.lag.value / found.measured.period
+    if own > _SLOW:
+        said.append(
+            f"the current loop is slow: its lag is {own:.2f} of a cycle, which a law has to know"
+        )
+    return said
+
+
+def torque_actual_gain(measured: Measured, servo: ServoFit) -> float | None:
+    """Return 0x6077 over the commanded torque, None if the drive does not report it.
+
+    A slow torque is compared: a moving average over ten cycles and more makes lags small.
+    """
+    actual, sent = measured.torque_actual, measured.torque
+    if np.array_equal(actual[1:], sent[:-1]) or not np.any(actual):
+        return None
+    length = max(10, math.ceil(10.0 * servo.total.value))
+    window = np.ones(length) / length
+    late = round(servo.total.value)
+    shown = np.convolve(actual[late:], window, "valid")
+    wanted = np.convolve(sent[: len(sent) - late], window, "valid")
+    return float(shown @ wanted / (wanted @ wanted))
+
+
+def toml_fragment(found: Identified) -> str:
+    """Return what was found as sections of a configuration."""
+    if found.hand is not None:
+        return ""
+    servo = found.servo
+    assert servo is not None
+    lines = [
+        "[mechanics]               # the free handle; a hand adds to it",
+        f"inertia_kg_m2 = {servo.inertia.value:.4g}",
+        f"viscous_nm_s_per_rad = {max(servo.viscous.value, 0.0):.3g}",
+        f"coulomb_nm = {max(servo.coulomb.value, 0.0):.3g}",
+        "",
+        "[drive]",
+    ]
+    if lag_is_known(servo):
+        lines.append(f"current_bandwidth_hz = {_bandwidth_hz(servo.lag.value):.0f}")
+        delay = servo.delay.high
+    else:
+        lines.append("current_bandwidth_hz = 0   # not told apart from the delay, which has it")
+        delay = servo.total.high
+    lines += [
+        "drive_cycle_s = 0.0        # not told apart from the delay, which has it",
+        "",
+        "[estimator]",
+        f"delay_cycles = {delay:.3f}      # upper end of the interval: too little costs more",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def lag_is_known(servo: ServoFit) -> bool:
+    """Return True if the lag of the current loop differs from none."""
+    return servo.lag.low > 0.0
+
+
+def write_report(found: Identified, settings: Settings, inertia: float | None = None) -> list[Path]:
+    """Write identify.txt, .toml, .json and .png into the folder of the record; return the paths.
+
+    Raises RecordError if they cannot be written.
+    """
+    folder = found.result.folder.path
+    paths = [folder / f"identify.{ending}" for ending in ("txt", "json", "png")]
+    try:
+        lines = report_lines(found, settings, inertia)
+        paths[0].write_text("\n".join(lines) + "\n", encoding="utf-8")
+        text = json.dumps(_json_content(found), indent=2, ensure_ascii=False)
+        paths[1].write_text(text + "\n", encoding="utf-8")
+        if found.servo is None:
+            return paths[:2]
+        draw(found, paths[2])
+        paths.append(folder / "identify.toml")
+        paths[-1].write_text(toml_fragment(found), encoding="utf-8")
+    except OSError as error:
+        raise RecordError(f"{folder}: {error.strerror}") from None
+    return paths
+
+
+def _line(name: str, estimate: Estimate, unit: str) -> str:
+    """Return a line with as many digits as the interval has."""
+    low, high = estimate.low, estimate.high
+    name_of = name if name.startswith(" ") else f"{name}"
+    return f"{name_of}: {estimate.value:.4g} {unit}".rstrip() + f" [{low:.4g}, {high:.4g}]"
+
+
+def _hand_lines(hand: HandFit) -> list[str]:
+    return [
+        _line("inertia of the operator", hand.inertia, "kg·m²"),
+        _line("damping of the operator", hand.damping, "N·m·s/rad"),
+        _line("stiffness of the operator", hand.stiffness, "N·m/rad"),
+        f"residuals: {hand.explained:.1%} of the motion explained",
+    ]
+
+
+def _stiction_line(found: Identified) -> str:
+    if found.stiction is None or len(found.stiction) < 4:
+        return "stiction: the handle did not break loose often enough to tell"
+    holding = found.stiction
+    half = 2.0 * float(holding.std(ddof=1)) / math.sqrt(len(holding))
+    return _line("stiction", Estimate(float(holding.mean()), half), "N·m")
+
+
+def _cogging_line(servo: ServoFit) -> str:
+    place, torque = servo.cogging
+    amplitude = 0.5 * float(np.ptp(torque))
+    power = np.abs(np.fft.rfft(torque * np.hanning(len(torque)), 8 * len(torque)))
+    power[:16] = 0.0
+    span = (place[1] - place[0]) * 8 * len(torque)
+    per_rev = 2.0 * math.pi * int(np.argmax(power)) / span
+    return f"cogging: {amplitude:.3g} N·m in amplitude, most of it {per_rev:.1f} times a revolution"
+
+
+def _bandwidth_hz(lag: float) -> float:
+    return 1.0 / (2.0 * math.pi * lag)
+
+
+def _bandwidth_text(servo: ServoFit) -> str:
+    if not lag_is_known(servo):
+        return "not told apart from none"
+    return f"{_bandwidth_hz(servo.lag.value):.0f} Hz"
+
+
+def _json_content(found: Identified) -> dict[str, Any]:
+    source = found.hand if found.hand is not None else found.servo
+    content: dict[str, Any] = {}
+    parts = dict(vars(source))
+    if found.servo is not None and found.servo.shaft is not None:
+        parts |= {f"shaft_{name}": value for name, value in vars(found.servo.shaft).items()}
+    for name, value in parts.items():
+        if isinstance(value, Estimate):
+            content[name] = {"value": value.value, "interval": [value.low, value.high]}
+    if found.servo is not None:
+        residuals = found.servo.residuals
+        content["cogging"] = found.servo.cogging.tolist()
+        content["residuals"] = {
+            "rms_steps": residuals.rms,
+            "explained": residuals.explained,
+            "autocorrelation": residuals.correlation.tolist(),
+            "white": residuals.white,
+        }
+    return content
+
+
+def draw(found: Identified, path: Path) -> None:
+    """Draw measured and modelled motion, what is left, cogging and break-away torques."""
+    servo, measured = found.servo, found.measured
+    assert servo is not None
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(12, 7.5), layout="constrained", dpi=120)
+        (motion, left), (cogging, whole) = figure.subplots(2, 2)
+        _draw_motion(motion, left, servo, measured)
+        place, torque = servo.cogging
+        cogging.plot(place, torque * 1e3, color=COLOURS[1])
+        cogging.set(title="cogging over position", xlabel="rad", ylabel="mN·m")
+        time = np.arange(len(measured.position)) * measured.period
+        whole.plot(time, measured.position, color=COLOURS[1], lw=0.6)
+        whole.set(title="the whole record", xlabel="s", ylabel="rad")
+        figure.savefig(path)
+
+
+def _draw_motion(motion: Axes, left: Axes, servo: ServoFit, measured: Measured) -> None:
+    time, position, model = servo.shown
+    begin = time - time[0]
+    # The mean speed hides what the torques do.
+    mean = np.polyval(np.polyfit(begin, position, 1), begin)
+    motion.plot(begin * 1e3, (position - mean) * 1e3, ".", ms=3, color=COLOURS[1], label="measured")
+    motion.plot(begin * 1e3, (model - mean) * 1e3, lw=0.8, color=COLOURS[0], label="model")
+    motion.set(title="position without its mean speed", xlabel="ms", ylabel="mrad")
+    motion.legend()
+    left.plot(begin * 1e3, (position - model) / measured.step, ".", ms=3, color=COLOURS[1])
+    left.axhline(0.5, color="black", lw=0.8, ls="--")
+    left.axhline(-0.5, color="black", lw=0.8, ls="--", label="half a step of the encoder")
+    left.set(title="measured minus model", xlabel="ms", ylabel="steps of the encoder")
+    left.legend()

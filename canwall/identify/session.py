@@ -1,0 +1,179 @@
+"""Identification of a servo on its bus: excitation, record, fit, report."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canwall.config import Settings
+from canwall.cycle import ExperimentError, WallAxis
+from canwall.identify.excitation import Excitation, HandExcitation
+from canwall.identify.fit import (
+    ServoFit,
+    UntellingDataError,
+    break_away,
+    encoder_step,
+    fit_servo,
+)
+from canwall.identify.hand import HandFit, fit_hand
+from canwall.run import RunResult, run
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What the cycle noted, one value per SYNC.
+
+    Attributes:
+        position: Positions [rad], NaN where a TPDO was missing.
+        torque: Commanded torques [N·m].
+        torque_actual: 0x6077 [N·m]; the commanded torque where the drive has none.
+        counts: Positions [counts].
+        period: SYNC period [s].
+        step: Step of the encoder [rad].
+    """
+
+    position: Array
+    torque: Array
+    torque_actual: Array
+    counts: NDArray[np.int64]
+    period: float
+    step: float
+
+
+@dataclass(frozen=True)
+class Identified:
+    """A servo that was identified.
+
+    Attributes:
+        result: The run and its folder.
+        measured: Positions and torques.
+        servo: The fit; None if it was stopped, or with a hand on the handle.
+        stiction: Torques at which the handle broke loose [N·m], without the cogging there.
+        hand: The operator, if he held the handle.
+    """
+
+    result: RunResult
+    measured: Measured
+    servo: ServoFit | None = None
+    stiction: Array | None = None
+    hand: HandFit | None = None
+
+
+class Identification:
+    """The excitation as an experiment on one axis."""
+
+    def __init__(self, axis: WallAxis, excitation: Excitation | HandExcitation) -> None:
+        self._axis, self._excitation = axis, excitation
+        self._position = 0.0
+        self._rows: list[tuple[float, float, float, int]] = []
+
+    def excite(self) -> bool:
+        """Set the torque of the next cycle; return False at the end."""
+        axis = self._axis
+        row = axis.row[0]
+        if row["received"]:
+            self._position = float(row["position_rad"])
+        try:
+            torque = self._excitation.next(self._position)
+        except UntellingDataError as error:
+            raise ExperimentError(axis, str(error)) from None
+        nm_per_mille = float(axis.cycle["nm_per_mille"][0])
+        axis.cycle["test_per_mille"] = 0 if torque is None else round(torque / nm_per_mille)
+        return torque is not None
+
+    def note(self) -> None:
+        """Note position and torques of the last cycle."""
+        row = self._axis.row[0]
+        position = float(row["position_rad"]) if row["received"] else np.nan
+        self._rows.append(
+            (position, float(row["torque_cmd"]), float(row["torque_actual"]), int(row["counts"]))
+        )
+
+    def conclude(self) -> None:
+        """Leave the fit to the time when the drive is disabled."""
+
+    def measured(self) -> Measured:
+        """Return what was noted. Raises UntellingDataError if the encoder did not move."""
+        columns = list(zip(*self._rows, strict=True)) or [(), (), (), ()]
+        position, torque, actual = (np.array(column, float) for column in columns[:3])
+        counts = np.array(columns[3], np.int64)
+        if len(counts) < 2 or not np.any(np.diff(counts)):
+            raise UntellingDataError("the position did not change by a single count")
+        axis = self._axis
+        step = encoder_step(counts) * abs(float(axis.cycle["rad_per_count"][0]))
+        return Measured(position, torque, actual, counts, axis.settings.bus.cycle_s, step)
+
+
+def identify(
+    settings: Settings,
+    output: Path | None,
+    with_hand: bool = False,
+    report: Callable[[str], None] = lambda what: None,
+    progress: Callable[[float, float | None], None] = lambda now_s, end_s: None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Identified:
+    """Excite the servo of a configuration and fit it (`canwall identify`).
+
+    Args:
+        settings: Configuration of the bench; its `[mechanics]` need to be right only roughly.
+        output: Folder of the record; None: a new folder below `runs`.
+        with_hand: An operator holds the handle, and he is what is identified; `[mechanics]` are
+            those of the free handle.
+        report: Called with each step.
+        progress: Called with the bus time done and its end [s].
+        stopped: Asked whether to end, in addition to signals.
+
+    Raises:
+        UntellingDataError: If the data do not tell.
+        Exception: What `run` raises.
+    """
+    made: list[Identification] = []
+
+    def experiment(axis: WallAxis) -> Identification:
+        kind = HandExcitation if with_hand else Excitation
+        excitation = kind(axis.settings, axis.setup.torque_limit_nm)
+        made.append(Identification(axis, excitation))
+        return made[0]
+
+    duration_s = HandExcitation.duration_s if with_hand else Excitation.duration_s
+    result = run(
+        _without_wall(settings, duration_s),
+        output,
+        report,
+        progress,
+        stopped,
+        experiment,
+    )
+    outcome = result.outcome
+    measured = made[0].measured()
+    if outcome.trips or outcome.interrupted:
+        return Identified(result, measured)
+    report("fitting")
+    if with_hand:
+        hand = fit_hand(measured.position, measured.torque, measured.period, settings)
+        return Identified(result, measured, hand=hand)
+    servo = fit_servo(measured.position, measured.torque, measured.period, measured.step)
+    places, torques = break_away(measured.position, measured.torque, measured.step)
+    # Cogging helps or hinders: what holds is the rest.
+    holding = np.abs(torques) - np.sign(torques) * np.interp(places, *servo.cogging)
+    return Identified(result, measured, servo, holding)
+
+
+def _without_wall(settings: Settings, duration_s: float) -> Settings:
+    """Return settings of a run in which the wall has no part."""
+    delay = settings.estimator.delay_cycles
+    estimator = {"measure_delay": False, "delay_cycles": 1.0 if delay is None else delay}
+    return settings.model_copy(
+        update={
+            "schedule": (),
+            "wall": settings.wall.model_copy(update={"alternate": ()}),
+            "estimator": settings.estimator.model_copy(update=estimator),
+            # The excitation puts energy in all the time.
+            "limits": settings.limits.model_copy(update={"energy_j": None}),
+            "run": settings.run.model_copy(update={"duration_s": duration_s}),
+        }
+    )
