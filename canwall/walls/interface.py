@@ -29,14 +29,9 @@ HORIZON = 64
 #: the same record with names to its options (`wall_with`): `wall.options.growth`.
 WALL = np.dtype(
     [
-        # The wall in force, and the one asked for: K_e = min(K, cap·m/T²) where there is a cap, and
-        # B = 2·ζ·√(K_e·m) where there is a damping ratio; zero: none.
+        # The wall to be rendered, as it is in force.
         ("stiffness", "f8"),
         ("damping", "f8"),
-        ("asked_stiffness", "f8"),
-        ("asked_damping", "f8"),
-        ("damping_ratio", "f8"),
-        ("cap", "f8"),
         # The plant: m·ÿ + b·ẏ + k_h·y = f + d, with its equivalent for forces held over T.
         ("mass", "f8"),
         ("viscous", "f8"),
@@ -64,6 +59,12 @@ WALL = np.dtype(
         ("absorbed", "f8"),
         ("y_before", "f8"),
         ("force_before", "f8"),
+        # What was asked for: K_e = min(K, cap·m/T²) is in force where there is a cap, and
+        # B = 2·ζ·√(K_e·m) where there is a damping ratio; zero: none.
+        ("asked_stiffness", "f8"),
+        ("asked_damping", "f8"),
+        ("damping_ratio", "f8"),
+        ("cap", "f8"),
         # The law's options, in the order in which its file declares them.
         ("option_values", "f8", (MAX_OPTIONS,)),
     ],

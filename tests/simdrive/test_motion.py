@@ -58,7 +58,14 @@ def test_what_moves_is_drive_and_hand_together() -> None:
     simulation = SMOOTH.model_copy(update={"coulomb_nm": 0.01, "cogging_nm": 0.003})
     cogs = {"cogging": 0.003, "cog_pitch": math.pi / 12.0}
     assert hand_plant(simulation) == pytest.approx(
-        {"mass": 1.64e-4, "viscous": 0.0261, "spring": 3.2, "coulomb": 0.01, **cogs}
+        {
+            "mass": 1.64e-4,
+            "viscous": 0.0261,
+            "spring": 3.2,
+            "coulomb": 0.01,
+            "stiction": 0.01,
+            **cogs,
+        }
     )
     assert handle_plant(simulation) == pytest.approx(
         {"mass": 1e-4, "viscous": 5e-4, "coulomb": 0.01, **cogs}
