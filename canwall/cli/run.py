@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich import box
 from rich.table import Table
 
 from canwall.cli.ending import FAILED, INTERRUPTED
@@ -155,14 +156,15 @@ def drive(
 
 
 def _strike_table(strikes: list[dict[str, Any]]) -> Table:
-    table = Table(title="Strikes", title_justify="left")
+    # Ten columns in a terminal of 80 characters.
+    table = Table(title="Strikes", title_justify="left", box=box.SIMPLE, padding=0)
     table.add_column("#", justify="right")
     table.add_column("law", no_wrap=True)
     table.add_column("K\n\\[N·m/rad]", justify="right")
     table.add_column("contacts", justify="right")
     table.add_column("deepest\n\\[mrad]", justify="right")
-    table.add_column("energy out\n\\[mJ]", justify="right")
-    table.add_column("first depth\n÷ referent", justify="right")
+    table.add_column("first ÷\nref.", justify="right")
+    table.add_column("energy\nout \\[mJ]", justify="right")
     table.add_column("ripple\n\\[N]", justify="right")
     table.add_column("chatter", no_wrap=True)
     for number, strike in enumerate(strikes, start=1):
@@ -175,8 +177,8 @@ def _strike_table(strikes: list[dict[str, Any]]) -> Table:
             f"{strike['stiffness']:g}",
             str(strike["contacts"]),
             f"{strike['peak_penetration_rad'] * 1e3:.2f}",
-            f"{strike['energy_out_j'] * 1e3:z.2f}",
             _depth_ratio(strike),
+            f"{strike['energy_out_j'] * 1e3:z.2f}",
             "–" if strike["felt_ripple_n"] is None else f"{strike['felt_ripple_n']:.2f}",
             chatter,
         )

@@ -34,7 +34,7 @@ def sweep(
         typer.Option(
             metavar="NAME=VALUES",
             help="Any other axis: a key of the configuration, or delay, counts, torque_step, "
-            "model, model_error, servo, speed, phase, start, press, press_torque, "
+            "model, model_error, servo, speed, phase, start, press, press_torque, sync_jitter, "
             "stiffness_normalised, damping_normalised; VALUES: A,B,C or LO:HI:N.",
         ),
     ] = None,

@@ -7,7 +7,7 @@ not simulated.
 
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -78,16 +78,37 @@ class Disturbances:
         lost: True for each SYNC whose TPDO is lost.
         late: True for each SYNC that gets the TPDO of the one before.
         skipped: SYNCs that the master skips after each one.
+        strays: Time by which each SYNC is later than its grid [s].
     """
 
     lost: NDArray[np.bool_]
     late: NDArray[np.bool_]
     skipped: NDArray[np.int64]
+    strays: Array
 
     @classmethod
     def none(cls, cycles: int) -> "Disturbances":
         """Return those of a bus and a master without faults, to be changed in place."""
-        return cls(np.zeros(cycles, bool), np.zeros(cycles, bool), np.zeros(cycles, np.int64))
+        return cls(
+            np.zeros(cycles, bool),
+            np.zeros(cycles, bool),
+            np.zeros(cycles, np.int64),
+            np.zeros(cycles),
+        )
+
+    @classmethod
+    def jitter(cls, cycles: int, deviation_s: float, period_s: float, seed: int) -> "Disturbances":
+        """Return those of a master whose SYNCs are normally distributed about their grid.
+
+        Args:
+            cycles: Number of SYNCs.
+            deviation_s: Standard deviation of a SYNC [s].
+            period_s: Period of the grid [s]; a SYNC deviates by 0.45 of it at most.
+            seed: Seed of the random numbers.
+        """
+        drawn = np.random.default_rng(seed).normal(0.0, deviation_s, cycles)
+        strays = np.clip(drawn, -0.45 * period_s, 0.45 * period_s)
+        return replace(cls.none(cycles), strays=strays)
 
 
 class LoopRecords(NamedTuple):
@@ -110,6 +131,7 @@ class LoopRecords(NamedTuple):
         lost: See `Disturbances`, as the following.
         late: TPDOs of the SYNC before.
         skipped: SYNCs skipped.
+        strays: SYNCs that are late.
     """
 
     cycle: NDArray[np.void]
@@ -128,6 +150,7 @@ class LoopRecords(NamedTuple):
     lost: NDArray[np.bool_]
     late: NDArray[np.bool_]
     skipped: NDArray[np.int64]
+    strays: Array
 
 
 def simulate(
@@ -217,6 +240,7 @@ class ClosedLoop:
             self._disturbances.lost,
             self._disturbances.late,
             self._disturbances.skipped,
+            self._disturbances.strays,
         )
 
 
@@ -326,7 +350,7 @@ def _run_cycles(loop: LoopRecords, rows: NDArray[np.void], signals: Array) -> in
     cycle: Record = cycles[0]
     servo: Record = servos[0]
     period, counts = cycle.period, servo.latched_counts
-    late, skipped = loop.late, loop.skipped
+    late, skipped, strays = loop.late, loop.skipped, loop.strays
     data = data_before = 0
     # Torques in per mille that are on their way: sent[k] was computed k samples ago.
     sent = np.zeros(MAX_DELAY + 2, np.int64)
@@ -353,15 +377,18 @@ def _run_cycles(loop: LoopRecords, rows: NDArray[np.void], signals: Array) -> in
             sent[k] = sent[k - 1]
         sent[0] = cycle.torque_per_mille
         hand_y, hand_v = servo.hand_y, servo.hand_v
+        # The hand's script is one of time, wherever the SYNCs are.
+        at_sync = push[j] + slope[j] * strays[j]
+        length = period + (strays[j + 1] - strays[j] if j + 1 < len(push) else 0.0)
         before = share * period
         if share > 0.0:
-            move_servo(servos, sent[whole + 1] * nm_per_mille, push[j], slope[j], before)
-        after = push[j] + slope[j] * before if share > 0.0 else push[j]
+            move_servo(servos, sent[whole + 1] * nm_per_mille, at_sync, slope[j], before)
+        after = at_sync + slope[j] * before if share > 0.0 else at_sync
         torque = sent[whole] * nm_per_mille
-        counts = move_servo(servos, torque, after, slope[j], period - before)
-        mean_push = push[j] + 0.5 * slope[j] * period
+        counts = move_servo(servos, torque, after, slope[j], length - before)
+        mean_push = at_sync + 0.5 * slope[j] * length
         signals[3, j] = mean_force(
-            loop.felt, hand_y, hand_v, servo.hand_y, servo.hand_v, mean_push, period
+            loop.felt, hand_y, hand_v, servo.hand_y, servo.hand_v, mean_push, length
         )
         if skipped[j]:
             # The hand, whose script is one of SYNCs, waits.

@@ -42,6 +42,7 @@ NAMED = {
     "start": ("rad", "distance from the wall at which the handle rests before the strike"),
     "press": ("s", "time for which the hand presses"),
     "press_torque": ("N*m", "torque with which the hand presses"),
+    "sync_jitter": ("s", "standard deviation of a SYNC from its grid"),
 }
 #: Axes of the wall itself: a strike is prepared once for all of their values.
 STIFFNESS = ("stiffness", "stiffness_normalised")
@@ -56,6 +57,7 @@ DEFAULTS: dict[str, tuple[Value, ...]] = {
     "start": (0.03,),
     "press": (0.6,),
     "press_torque": (0.15,),
+    "sync_jitter": (0.0,),
     "speed": (0.5, 1.0, 2.0),
     "phase": (0.0, 0.35, 0.7),
 }
@@ -143,7 +145,7 @@ def _check(name: str, value: Value) -> None:
     if not number or not math.isfinite(value):  # type: ignore[arg-type]
         raise InputError(f"sweep axis {name}: has to be a number, not {value!r}")
     low = {"model_error": -1.0}.get(name, 0.0)
-    low_allowed = name in ("damping", "damping_normalised", "delay", "phase")
+    low_allowed = name in ("damping", "damping_normalised", "delay", "phase", "sync_jitter")
     if not (value > low or (low_allowed and value == low)):  # type: ignore[operator]
         bound = "at least" if low_allowed else "greater than"
         raise InputError(f"sweep axis {name}: has to be {bound} {low:g}, not {value!r}")

@@ -122,6 +122,12 @@ class Plan:
         """Return the settings of one strike. Raises ConfigError."""
         return settings_at(self.base, {**point, **strike})
 
+    def prepare(self, point: Mapping[str, Value], strike: Mapping[str, Value]) -> PreparedStrike:
+        """Prepare one strike. Raises ConfigError, or InputError if it cannot be by frames."""
+        (still,) = DEFAULTS["sync_jitter"]
+        jitter = float(point.get("sync_jitter", still))
+        return PreparedStrike(self.settings(point, strike), self.through, jitter)
+
 
 def make_plan(base: Settings, given: Mapping[str, object], through: str = "sim") -> Plan:
     """Make a plan from the axes in `[sweep]` and those given, which take precedence.
@@ -173,10 +179,10 @@ def make_plan(base: Settings, given: Mapping[str, object], through: str = "sim")
 def _check_values(plan: Plan) -> None:
     """Prepare a strike for each value of each axis, with the first value of the others."""
     first, strike = plan.points[0], plan.strikes[0]
-    PreparedStrike(plan.settings(first, strike))
+    plan.prepare(first, strike)
     for axis in plan.conditions:
         for value in axis.values[1:]:
-            PreparedStrike(plan.settings({**first, axis.name: value}, strike))
+            plan.prepare({**first, axis.name: value}, strike)
     for other in plan.strikes[1:]:
         plan.settings(first, other)
 
@@ -185,9 +191,7 @@ def compute_piece(plan: Plan, piece: int) -> NDArray[np.void]:
     """Compute a piece of work; shape (strikes, walls), dtype of the plan."""
     condition, strikes, walls = plan.slices(piece)
     point = plan.points[condition]
-    prepared = [
-        PreparedStrike(plan.settings(point, s), plan.through) for s in plan.strikes[strikes]
-    ]
+    prepared = [plan.prepare(point, strike) for strike in plan.strikes[strikes]]
     mass, period = prepared[0].mass, prepared[0].period
     damping_unit = mass / period if plan.damping.name == "damping_normalised" else 1.0
     if plan.stiffness is None:

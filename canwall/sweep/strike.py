@@ -12,9 +12,16 @@ from canwall.analysis.strike import MEASURES, measure_strike
 from canwall.compiled import Record, compiled
 from canwall.config import ConfigError, Hand, Mechanics, Settings
 from canwall.cycle import run_laws
+from canwall.errors import InputError
 from canwall.record import ROW, Phase, Ring
 from canwall.run import drive_dictionary, make_axis, make_exchange, on_the_bus, render
-from canwall.run.closed_loop import ENABLING_CYCLES, ClosedLoop, LoopRecords, simulate_wall
+from canwall.run.closed_loop import (
+    ENABLING_CYCLES,
+    ClosedLoop,
+    Disturbances,
+    LoopRecords,
+    simulate_wall,
+)
 from canwall.run.referent import Referent
 
 Array = NDArray[np.float64]
@@ -166,13 +173,32 @@ def strike_settings(
 class PreparedStrike:
     """One strike, prepared once, to be rendered on one wall after another and judged."""
 
-    def __init__(self, settings: Settings, through: str = "sim") -> None:
-        """Prepare the strike of `strike_settings`, in memory ("sim") or by frames ("bus")."""
+    def __init__(
+        self, settings: Settings, through: str = "sim", sync_jitter_s: float = 0.0
+    ) -> None:
+        """Prepare a strike.
+
+        Args:
+            settings: Settings from `strike_settings`.
+            through: "sim": in memory; "bus": by frames.
+            sync_jitter_s: Standard deviation of a SYNC from its grid [s], in memory only.
+
+        Raises:
+            InputError: For jitter by frames, whose simulated time has none.
+        """
+        if through == "bus" and sync_jitter_s > 0.0:
+            raise InputError("sweep axis sync_jitter: has to be 0 with --through bus")
         assert settings.run.duration_s is not None
         assert settings.simulation is not None
         self._settings = settings
         self._cycles = round(settings.run.duration_s / settings.bus.cycle_s)
-        self._loop = ClosedLoop(settings, self._cycles).records()
+        self._loop = ClosedLoop(
+            settings,
+            self._cycles,
+            disturbances=Disturbances.jitter(
+                self._cycles, sync_jitter_s, settings.bus.cycle_s, settings.simulation.seed
+            ),
+        ).records()
         referent = Referent(settings, settings.simulation, self._cycles)
         self._referent = referent.inputs(np.full(self._cycles, settings.wall.position_rad))
         self._band = felt_band(settings.bus.cycle_s)

@@ -222,3 +222,18 @@ def test_position_goes_on_beyond_32_bits(side: str, direction: float) -> None:
     assert not beyond.all()
     # Cogging and rounding differ at the other place.
     np.testing.assert_allclose(far["y"], near["y"], atol=2e-4)
+
+
+def test_a_syncs_jitter_is_time_in_which_the_handle_goes_on() -> None:
+    """At each SYNC the handle is where it is on the grid, plus its speed times the SYNC's error."""
+    settings, _ = wall(1e-3, 0.0, **{"simulation.coulomb_nm": 0.0})
+    cycles, deviation = 290, 5e-5
+    quiet = simulate(settings, cycles)
+    jitter = Disturbances.jitter(cycles, deviation, 1e-3, seed=4)
+    late = jitter.strays
+    assert late.std() == pytest.approx(deviation, rel=0.2)
+    moved = simulate(settings, cycles, disturbances=jitter).positions - quiet.positions
+    speed = np.gradient(quiet.positions, 1e-3)
+    assert np.abs(speed).max() > 2.0
+    count = 2.0 * np.pi / 131072
+    assert np.abs(moved - speed * late).max() < 0.05 * np.abs(speed * late).max() + 2.0 * count

@@ -142,11 +142,16 @@ def test_a_buzz_within_six_counts_is_felt() -> None:
 
 
 @pytest.mark.parametrize(
-    "axis",
-    ["simulation.current_bandwidth_hz", "simulation.viscous_nm_s_per_rad", "press_torque"],
+    ("axis", "values"),
+    [
+        ("simulation.current_bandwidth_hz", [800.0, 1600.0]),
+        ("simulation.viscous_nm_s_per_rad", [1e-4, 1e-3]),
+        ("press_torque", [0.1, 0.2]),
+        ("sync_jitter", [0.0, 1e-4]),
+    ],
 )
-def test_any_number_of_the_plant_is_an_axis(axis: str) -> None:
-    plan = plan_of(stiffness=[20.0], **{axis: [0.1, 0.2]})
+def test_numbers_of_plant_and_strike_are_axes(axis: str, values: list[float]) -> None:
+    plan = plan_of(stiffness=[20.0], **{axis: values})
     one, other = (compute_piece(plan, piece)[0, 0] for piece in range(2))
     assert one["penetration"] != other["penetration"]
 
@@ -446,6 +451,7 @@ def test_a_worker_that_dies_is_one_line(tmp_path: Path) -> None:
         ({"counts": "10.5"}, "has to be a whole number"),
         ({"torque_step": "1.5e-7"}, "whole µN·m"),
         ({"stiffness": "1", "stiffness_normalised": "1"}, "keep one of them"),
+        ({"through": "bus", "sync_jitter": "1e-5"}, "sync_jitter: has to be 0 with --through bus"),
     ],
 )
 def test_a_wrong_axis(axes: dict[str, str], message: str) -> None:
