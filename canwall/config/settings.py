@@ -121,6 +121,12 @@ class Limits(Section):
         return value
 
 
+class Guard(Section):
+    """`[guard]`: what becomes of a wall that buzzes: nothing, a word, or less force for a while."""
+
+    action: Literal["off", "warn", "act"] = "off"
+
+
 class Run(Section):
     """`[run]`: duration, times over which walls fade in and change, format of the bus log."""
 
@@ -179,6 +185,7 @@ class Settings(Section):
     wall: Wall = Wall()
     estimator: Estimator = Estimator()
     limits: Limits
+    guard: Guard = Guard()
     run: Run = Run()
     simulation: Simulation | None = None
     schedule: tuple[Scheduled, ...] = ()

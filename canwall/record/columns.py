@@ -73,6 +73,7 @@ COLUMNS = (
     Column("stiffness", "f8", "N·m/rad", "stiffness of the wall"),
     Column("damping", "f8", "N·m·s/rad", "damping of the wall"),
     Column("wall_position_rad", "f8", "rad", "position of the wall on the drive's axis"),
+    Column("guard", "f8", "", "factor of the guard on the force of the law; 1: untouched"),
     Column("sync_interval_s", "f8", "s", "time since the SYNC before, measured", by_clock=True),
     Column("latency_s", "f8", "s", "time from reception of the TPDO to the RPDO", by_clock=True),
 )
