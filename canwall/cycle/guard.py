@@ -7,7 +7,7 @@ be known:
   dozen times by more than RIPPLE_NM: within 100 ms of which no 20 ms were much quieter than the
   others, or within 200 ms without falling to half. A bounce dies away.
 - **A contact that gives off more than it took.** The wall has put out more energy than the operator
-  put in, and the handle leaves faster than it came. One alone is no sign: a hand that withdraws
+  put in, and the handle leaves faster than it came. Either alone is no sign: a hand that withdraws
   leaves faster, and on a soft wall friction takes what sampling adds. While the force is lowered,
   leaving nearly as fast is enough: the wall has gone on feeding the handle.
 
@@ -40,6 +40,9 @@ SWINGS = 12
 #: Energy given off in a contact over that taken in; speed out over speed in, and as long as the
 #: force is lowered.
 GAIN, FASTER, AGAIN = 0.2, 1.1, 0.8
+#: Longest contact whose speeds on entry and leaving have to do with each other [s], and least way
+#: within the span before one that counts [counts].
+BOUNCE_S, _LEAST_WAY = 0.1, 8.0
 #: Uncertainty of the energy [counts times peak force], and of the way over the span [counts].
 _ENERGY_COUNTS, _WAY_COUNTS = 4.0, 2.0
 #: Cycles over which the speeds of a contact are measured.
@@ -61,6 +64,7 @@ GUARD = np.dtype(
         ("count", "f8"),
         ("rise", "f8"),
         ("hold", "i8"),
+        ("longest", "i8"),
         ("held", "i8"),  # cycles since the last alarm
         # The band-pass as two second-order sections, and their states.
         ("sections", "f8", (2, 6)),
@@ -79,6 +83,7 @@ GUARD = np.dtype(
         ("way", "f8", (_SPAN + 1,)),
         # The present contact, or the last one until its speed on leaving is known.
         ("inside", "?"),
+        ("lasted", "i8"),
         ("outside", "i8"),
         ("work", "f8"),  # put out so far
         ("taken", "f8"),
@@ -100,6 +105,7 @@ def set_guard(guard: NDArray[np.void], action: str, period: float, count: float)
     guard["count"] = abs(count)
     guard["block"] = max(1, round(BLOCK_S / period))
     guard["hold"] = round(HOLD_S / period)
+    guard["longest"] = round(BOUNCE_S / period)
     guard["rise"] = math.exp(period / RISE_S)
     if guard["action"] != _OFF:
         guard["sections"] = band_pass(period)
@@ -184,9 +190,9 @@ def _ripples(guard: Record, force: float) -> bool:
     _push(guard.swings, guard.swung)
     guard.peak = guard.squares = guard.swung = 0.0
     blocks = guard.filled // guard.block
-    return (
-        blocks >= STEADY_BLOCKS and _lasts(guard, guard.amplitudes, STEADY_BLOCKS, STEADY)
-    ) or (blocks >= LASTING_BLOCKS and _lasts(guard, guard.peaks, LASTING_BLOCKS, LASTING))
+    return (blocks >= STEADY_BLOCKS and _lasts(guard, guard.amplitudes, STEADY_BLOCKS, STEADY)) or (
+        blocks >= LASTING_BLOCKS and _lasts(guard, guard.peaks, LASTING_BLOCKS, LASTING)
+    )
 
 
 @compiled
@@ -216,6 +222,7 @@ def _feeds(guard: Record, position: float, surface: float, force: float) -> bool
         way[k] = way[k - 1]
     way[0] = position
     if guard.inside:
+        guard.lasted += 1
         guard.work += force * moved
         guard.taken = max(guard.taken, -guard.work)
         guard.largest = max(guard.largest, abs(force))
@@ -225,6 +232,7 @@ def _feeds(guard: Record, position: float, surface: float, force: float) -> bool
         return False
     if position < surface:
         guard.inside = True
+        guard.lasted = 0
         guard.work = force * moved
         guard.taken = guard.largest = 0.0
         guard.way_in = way[_SPAN] - position
@@ -232,7 +240,8 @@ def _feeds(guard: Record, position: float, surface: float, force: float) -> bool
     # The force of the last sample inside may act for some cycles more.
     guard.work += force * moved
     guard.outside += 1
-    if guard.outside != _SPAN:
+    counts = guard.way_in > _LEAST_WAY * guard.count and guard.lasted < guard.longest
+    if guard.outside != _SPAN or not counts:
         return False
     tolerance = _ENERGY_COUNTS * guard.count * guard.largest
     ratio = FASTER if guard.factor == 1.0 else AGAIN

@@ -85,7 +85,12 @@ def write_result(
     except RecordError as error:
         notes.append(str(error))  # the trip is told nevertheless
     return RunResult(
-        folder, summary, outcome, notes, [*remarks, *_remarks_on_lag(axis), *_remarks_on_guard(axis)], not_restored
+        folder,
+        summary,
+        outcome,
+        notes,
+        [*remarks, *_remarks_on_lag(axis), *_remarks_on_guard(axis)],
+        not_restored,
     )
 
 
@@ -121,7 +126,7 @@ def _remarks_on_guard(axis: WallAxis) -> list[str]:
     found = _guard_summary(axis)
     if not found["alarms"]:
         return []
-    done = "guard.action = \"act\" would make it softer"
+    done = 'guard.action = "act" would make it softer'
     if found["action"] == "act":
         done = f"its force was lowered, to {found['least_force']:.2g} of the law's at the least"
     times = "once" if found["alarms"] == 1 else f"{found['alarms']} times"

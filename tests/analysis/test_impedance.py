@@ -32,9 +32,7 @@ def test_mass_spring_and_damper_of_a_wall_at_the_lines_of_a_multisine() -> None:
     push = multisine(lines, 16_000, 4)
     t = np.arange(len(push)) * PERIOD / 16.0
     y = lsim(WALL, push, t)[1]
-    found = impedance_at_lines(
-        push.reshape(4, -1)[2:], y.reshape(4, -1)[2:], PERIOD / 16.0, lines
-    )
+    found = impedance_at_lines(push.reshape(4, -1)[2:], y.reshape(4, -1)[2:], PERIOD / 16.0, lines)
     np.testing.assert_allclose(found.impedance, expected(found.frequency), rtol=2e-3)
     assert found.coherence.min() > 1.0 - 1e-9
     low, high = found.frequency < 90.0, found.frequency > 100.0

@@ -177,7 +177,7 @@ def test_plain_wall_at_20_times_its_limit_is_softened_in_time(operator: str) -> 
     def given_off(rows: NDArray[np.void]) -> float:
         return float(np.maximum(rows["force_applied"][:-1] * np.diff(rows["y"]), 0.0)[after].sum())
 
-    assert given_off(rows) < 0.1 * given_off(alone)
+    assert given_off(rows) < 0.25 * given_off(alone)
     if operator in ("finger", "grip"):
         ripple = sosfilt(made()["sections"][0], rows["force_applied"])[after]
         assert math.sqrt(float((ripple**2).mean())) < 0.1 * 0.08  # 0.1 N at 80 mm
