@@ -6,6 +6,7 @@ sample to its torque in periods. B acts on the backward difference of the positi
 """
 
 import math
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,3 +118,41 @@ def stable_stiffness(
         middle = math.sqrt(low * high)
         low, high = (middle, high) if is_stable(middle) else (low, middle)
     return low * mass / period**2
+
+
+class DiolaitiRegion(StrEnum):
+    """Regions of the plane of viscous damping β and Coulomb friction σ."""
+
+    PASSIVE = "passive"
+    LIMIT_CYCLE = "limit cycle"
+    LOCALLY_STABLE = "locally stable"
+    UNSTABLE = "unstable"
+
+
+def diolaiti_plane(
+    stiffness: Array, viscous: Array, coulomb: Array, count: float, period: float
+) -> tuple[Array, Array]:
+    """Return β = b/(K·T) and σ = f_c/(K·Δ) of plain walls.
+
+    Args:
+        stiffness: Stiffness K [N·m/rad], shape (n,), like the following.
+        viscous: Damping b of everything that moves [N·m·s/rad].
+        coulomb: Coulomb friction f_c [N·m].
+        count: One encoder count Δ [rad].
+        period: Sampling period T [s].
+    """
+    return viscous / (stiffness * period), coulomb / (stiffness * count)
+
+
+def diolaiti_region(beta: float, sigma: float, delay: float) -> DiolaitiRegion:
+    """Return the region of a plain wall with a delay of D periods.
+
+    Damping of β > 1/2 + D takes what sampling and delay give off at any amplitude; friction of
+    σ > 1/2 takes what a quantised position gives off, and holds any motion that is small enough.
+    Without the friction there is a cycle of some counts, without the damping a large motion grows
+    (N. Diolaiti, G. Niemeyer, F. Barbagli and J. K. Salisbury, IEEE Trans. Robotics 22(2), 2006).
+    """
+    damped, held = beta > 0.5 + delay, sigma > 0.5
+    if damped:
+        return DiolaitiRegion.PASSIVE if held else DiolaitiRegion.LIMIT_CYCLE
+    return DiolaitiRegion.LOCALLY_STABLE if held else DiolaitiRegion.UNSTABLE

@@ -63,10 +63,10 @@ def effective_impedance(push: Array, y: Array, cycle_s: float, segment: int) -> 
 
     if len(push) < 2 * segment:
         raise ValueError(f"{len(push)} cycles are less than two segments of {segment}")
-    options = {"fs": 1.0 / cycle_s, "nperseg": segment}
-    frequency, of_force = welch(push, **options)
-    _, of_position = welch(y, **options)
-    _, cross = csd(push, y, **options)
+    rate = 1.0 / cycle_s
+    frequency, of_force = welch(push, rate, nperseg=segment)
+    _, of_position = welch(y, rate, nperseg=segment)
+    _, cross = csd(push, y, rate, nperseg=segment)
     coherence = np.abs(cross) ** 2 / (of_force * of_position)
     # Without the mean, which the segments do not contain.
     return EffectiveImpedance(frequency[1:], (of_force / cross)[1:], coherence[1:])

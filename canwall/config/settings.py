@@ -148,6 +148,12 @@ class Limits(Section):
         return value
 
 
+class Guard(Section):
+    """`[guard]`: what becomes of a wall that buzzes: nothing, a word, or less force for a while."""
+
+    action: Literal["off", "warn", "act"] = "off"
+
+
 class Run(Section):
     """`[run]`: duration, times over which walls fade in and change, format of the bus log."""
 
@@ -207,6 +213,7 @@ class Settings(Section):
     estimator: Estimator = Estimator()
     operator: Operator = Operator()
     limits: Limits
+    guard: Guard = Guard()
     run: Run = Run()
     simulation: Simulation | None = None
     schedule: tuple[Scheduled, ...] = ()

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from canwall.analysis.metrics import STRIKE_GAP_S
 from canwall.config import Limits, Settings, Wall
+from canwall.cycle.guard import GUARD, set_guard
 from canwall.drive import DriveSetup, PdoLayout
 from canwall.drive import objects as od
 from canwall.walls import (
@@ -107,6 +108,7 @@ CYCLE = np.dtype(
         # The wall as it goes on without TPDOs, at the positions that the estimator predicts.
         ("blind", RENDERED, (1,)),
         ("is_blind", "?"),
+        ("guard", GUARD, (1,)),
         ("estimator", ESTIMATOR, (1,)),
         ("bank", BANK, (1,)),
         # The estimator for TPDOs that are a cycle late since one was missing: while it is being
@@ -186,6 +188,7 @@ def make_cycle(settings: Settings, setup: DriveSetup, laws: Sequence[Law]) -> ND
     delay = settings.estimator.delay_cycles
     set_delay(cycle, settings, modelled_delay(settings) if delay is None else delay)
     set_limits(cycle, settings.limits)
+    set_guard(cycle["guard"][0], settings.guard.action, period, setup.units.rad_per_count)
     mass, viscous, spring = _model(settings)
     if settings.operator.adapt:
         masses, dampings = _hands(settings)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
+from canwall.cycle.guard import watch
 from canwall.cycle.state import RECENT_CYCLES
 from canwall.cycle.trips import Trip, check_limits, compare_position, compare_torque
 from canwall.record import Phase
@@ -141,7 +142,7 @@ def _force_of(cycle: Record, rendered: Record, due: bool) -> float:
         cycle.evaluated = rendered.law + 1
         rendered.force = wall_force(cycle.laws[rendered.law], rendered.wall[0])
         cycle.evaluated = 0
-    return rendered.force
+    return cycle.guard[0].factor * rendered.force
 
 
 @compiled
@@ -345,6 +346,14 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
         cycle.missed_tpdo += 1
         cycle.missed_recently |= 1
     _account_contact(cycle, received)
+    watch(
+        cycle.guard[0],
+        cycle.j,
+        cycle.oriented,
+        cycle.orientation * rendered.position,
+        cycle.force_applied,
+        received and cycle.phase == _RENDERING,
+    )
     begins_lag = False
     if received:
         compare_position(cycle, cycle.counts - before, missed)
@@ -406,6 +415,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     row.mass_est = estimator.mass
     row.mass_spread = cycle.bank[0].spread
     row.wall_position_rad = rendered.position
+    row.guard = cycle.guard[0].factor
     cycle.j += 1
     return _placed(cycle.controlword, cycle.out_controlword[0]) | _placed(
         per_mille, cycle.out_torque[0]

@@ -76,6 +76,7 @@ COLUMNS = (
     Column("mass_est", "f8", "kg·m²", "mass in force in the model: drive, handle and hand"),
     Column("mass_spread", "f8", "", "its standard deviation, relative; 0: nothing learned"),
     Column("wall_position_rad", "f8", "rad", "position of the wall on the drive's axis"),
+    Column("guard", "f8", "", "factor of the guard on the force of the law; 1: untouched"),
     Column("sync_interval_s", "f8", "s", "time since the SYNC before, measured", by_clock=True),
     Column("latency_s", "f8", "s", "time from reception of the TPDO to the RPDO", by_clock=True),
 )

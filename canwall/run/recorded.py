@@ -93,6 +93,7 @@ def _summary_from_rows(folder: RunFolder, signals: "pa.Table") -> dict[str, Any]
         "tpdo_lag_cycles": None,
         "skipped_sync": None,
         "late_rpdo": None,
+        "guard": None,
         "error_frames": _error_frames(folder.path / settings.run.bus_log),
         "trips": [
             f"the run did not end by itself: it was cut off while {phase.name.lower()}, after "

@@ -62,6 +62,7 @@ def write_result(
         "tpdo_lag_cycles": int(axis.cycle["lag"][0]),
         "skipped_sync": int(axis.cycle["skipped_sync"][0]),
         "late_rpdo": axis.late_rpdo,
+        "guard": _guard_summary(axis),
         "error_frames": monitor.error_frames,
         "trips": outcome.trips,
         "trip_cycle": outcome.trip_cycle,
@@ -84,7 +85,12 @@ def write_result(
     except RecordError as error:
         notes.append(str(error))  # the trip is told nevertheless
     return RunResult(
-        folder, summary, outcome, notes, [*remarks, *_remarks_on_lag(axis)], not_restored
+        folder,
+        summary,
+        outcome,
+        notes,
+        [*remarks, *_remarks_on_lag(axis), *_remarks_on_guard(axis)],
+        not_restored,
     )
 
 
@@ -103,6 +109,29 @@ def _remarks_on_lag(axis: WallAxis) -> list[str]:
         f"TPDOs have been late by a cycle since one was missing: the delay is {axis.delay + lag:g} "
         f"cycles, for which the estimator allows; look to the drive's timing and the bus load"
     ]
+
+
+def _guard_summary(axis: WallAxis) -> dict[str, Any]:
+    """Return the alarms of the guard, the time of the first, and the least force that it left."""
+    guard, period = axis.cycle["guard"][0], axis.settings.bus.cycle_s
+    first = int(guard["first_alarm"])
+    return {
+        "action": axis.settings.guard.action,
+        "alarms": int(guard["alarms"]),
+        "first_alarm_s": None if first < 0 else first * period,
+        "least_force": float(guard["lowest"]),
+    }
+
+
+def _remarks_on_guard(axis: WallAxis) -> list[str]:
+    found = _guard_summary(axis)
+    if not found["alarms"]:
+        return []
+    done = 'guard.action = "act" would make it softer'
+    if found["action"] == "act":
+        done = f"its force was lowered, to {found['least_force']:.2g} of the law's at the least"
+    times = "once" if found["alarms"] == 1 else f"{found['alarms']} times"
+    return [f"guard: the wall buzzed {times}, first at {found['first_alarm_s']:.3f} s; {done}"]
 
 
 def _real_time_summary(axis: WallAxis, exchange: Exchange) -> dict[str, Any]:

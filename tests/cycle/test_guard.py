@@ -1,0 +1,192 @@
+"""The guard: its signs on made-up motions, its factor, and walls that buzz or do not."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.signal import sosfilt
+
+from canwall.config import Settings, load
+from canwall.cycle import guard
+from canwall.run.closed_loop import simulate
+from canwall.sweep.strike import OPERATORS, strike_settings
+
+Array = NDArray[np.float64]
+
+PERIOD, COUNT = 1e-3, 5e-5
+CONFIGURATION = load(Path(__file__).parents[2] / "config/sim.toml")
+
+
+def made(action: str = "act", period: float = PERIOD) -> NDArray[np.void]:
+    record = np.zeros(1, guard.GUARD)
+    guard.set_guard(record[0], action, period, COUNT)
+    return record
+
+
+def watched(record: NDArray[np.void], y: Array, force: Array) -> Array:
+    """Factor after each cycle; force[j] is held from y[j] to y[j + 1]."""
+    factors = np.empty(len(y))
+    for j in range(len(y)):
+        guard.watch(record[0], j, y[j], 0.0, force[j - 1] if j else 0.0, True)
+        factors[j] = record["factor"][0]
+    return factors
+
+
+@pytest.mark.parametrize("period", [0.00025, 0.0005, 0.001, 0.002, 0.005, 0.01])
+def test_band_pass_is_scipy_s_and_has_its_band(period: float) -> None:
+    record = made(period=period)
+    signal = np.random.default_rng(0).normal(size=500)
+    passed = [guard._filtered(record[0], value) for value in signal]
+    np.testing.assert_allclose(passed, sosfilt(record["sections"][0], signal), atol=1e-12)
+
+    def gain(frequency: float) -> float:
+        t = np.arange(int(1.0 / period)) * period
+        out = sosfilt(record["sections"][0], np.sin(2.0 * np.pi * frequency * t))
+        return float(np.abs(out[len(out) // 2 :]).max())
+
+    assert gain(2.0) < 0.02
+    assert gain(35.0) > 0.85
+    if period < 0.0005:
+        assert gain(1900.0) < 0.05
+
+
+def ripple(frequency: float, amplitude: float, decay_s: float = math.inf) -> Array:
+    t = np.arange(600) * PERIOD
+    return np.asarray(0.15 + amplitude * np.exp(-t / decay_s) * np.sin(2.0 * np.pi * frequency * t))
+
+
+@pytest.mark.parametrize("frequency", [65.0, 120.0, 260.0, 430.0])
+def test_ripple_that_stays(frequency: float) -> None:
+    inside = np.full(600, -0.01)
+    factors = watched(made(), inside, ripple(frequency, 0.1))
+    assert int(np.flatnonzero(factors < 1.0)[0]) <= 140
+    assert factors[-1] == pytest.approx(max(0.3 ** np.count_nonzero(np.diff(factors)), 0.01))
+    assert (watched(made(), inside, ripple(frequency, 0.04)) == 1.0).all()
+    assert (watched(made(), inside, ripple(frequency, 0.5, 0.05)) == 1.0).all()
+    warned = made("warn")
+    assert (watched(warned, inside, ripple(frequency, 0.1)) == 1.0).all()
+    assert warned["alarms"][0] > 0
+    silent = made("off")
+    watched(silent, inside, ripple(frequency, 0.1))
+    assert silent["alarms"][0] == 0
+
+
+def test_slow_ripple_within_200_ms() -> None:
+    factors = watched(made(), np.full(600, -0.01), ripple(35.0, 0.1))
+    assert 190 <= int(np.flatnonzero(factors < 1.0)[0]) <= 240
+
+
+def test_a_step_and_a_steady_push_are_no_ripple() -> None:
+    force = np.repeat([0.0, 0.5, 0.1, 1.5], 150)
+    assert (watched(made(), np.full(600, -0.01), force) == 1.0).all()
+
+
+def bounce(restitution: float) -> tuple[Array, Array]:
+    """Free flight, half a sine inside with a force that gives e² of the energy back, flight."""
+    mass, speed, contact = 2e-4, 1.0, 40
+    rate = math.pi / (contact * PERIOD)
+    t = np.arange(contact) * PERIOD
+    depth = speed / rate * np.sin(rate * t)
+    stiffness = mass * rate**2
+    force = stiffness * depth * np.where(t < 0.5 * contact * PERIOD, 1.0, restitution**2)
+    out = np.arange(60) * PERIOD
+    y = np.concatenate([speed * out[::-1], -depth, restitution * speed * out])
+    return y, np.concatenate([np.zeros(60), force, np.zeros(60)])
+
+
+@pytest.mark.parametrize(
+    ("restitution", "alarms"), [(0.3, 0), (0.9, 0), (1.0, 0), (1.2, 1), (2.0, 1)]
+)
+def test_contact_that_feeds_the_handle(restitution: float, alarms: int) -> None:
+    record = made()
+    factors = watched(record, *bounce(restitution))
+    assert record["alarms"][0] == alarms
+    assert factors[-1] == (0.1 if alarms else 1.0)
+    if alarms:
+        assert record["first_alarm"][0] <= 60 + 40 + 10
+
+
+def test_force_returns_slowly() -> None:
+    record = made()
+    watched(record, *bounce(2.0))
+    resting = np.full(9000, 0.1)
+    factors = watched(record, resting, np.zeros(9000))
+    assert factors[900] == pytest.approx(0.1)
+    assert factors[1000 + 2000] / factors[1000] == pytest.approx(math.e, rel=0.1)
+    assert factors[-1] == 1.0
+    assert record["lowest"][0] == pytest.approx(0.1)
+
+
+def struck(operator: str, action: str, law: str, k: float, speed: float = 0.7) -> Settings:
+    """A strike on a wall of K·T²/m = k, with the model matched."""
+    simulation = CONFIGURATION.simulation
+    assert simulation is not None
+    hand = {key.rsplit(".")[-1]: value for key, value in OPERATORS[operator].keys.items()}
+    simulation = simulation.model_copy(update={"hand": simulation.hand.model_copy(update=hand)})
+    mass = simulation.inertia_kg_m2 + hand["inertia_kg_m2"]
+    model = {
+        "inertia_kg_m2": mass,
+        "viscous_nm_s_per_rad": simulation.viscous_nm_s_per_rad + hand["damping_nm_s_per_rad"],
+    }
+    wall = {"law": law, "stiffness_nm_per_rad": k * mass / PERIOD**2, "damping_nm_s_per_rad": 0.0}
+    settings = CONFIGURATION.model_copy(
+        update={
+            "simulation": simulation,
+            "mechanics": CONFIGURATION.mechanics.model_copy(update=model),
+            "wall": CONFIGURATION.wall.model_copy(update=wall),
+            "guard": CONFIGURATION.guard.model_copy(update={"action": action}),
+            "schedule": (),
+        }
+    )
+    return strike_settings(settings, speed, 0.3, 0.02, 0.5)
+
+
+def cycles_of(settings: Settings) -> int:
+    assert settings.run.duration_s is not None
+    return round(settings.run.duration_s / PERIOD)
+
+
+def test_a_guard_that_only_warns_changes_no_bit() -> None:
+    runs = [
+        simulate(settings, cycles_of(settings)).rows
+        for settings in (struck("grip", action, "standard", 1.5) for action in ("off", "warn"))
+    ]
+    assert runs[0].tobytes() == runs[1].tobytes()
+
+
+#: K·T²/m at which the plain wall begins to chatter, by operator.
+LIMITS = {"none": 0.004, "finger": 0.11, "grip": 0.08, "hand": 0.004}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("operator", LIMITS)
+def test_plain_wall_at_20_times_its_limit_is_softened_in_time(operator: str) -> None:
+    def strike(action: str) -> tuple[NDArray[np.void], int]:
+        settings = struck(operator, action, "standard", 20.0 * LIMITS[operator])
+        rows = simulate(settings, cycles_of(settings)).rows
+        return rows, int(np.flatnonzero(rows["y"] < 0.0)[0])
+
+    (rows, first), (alone, _) = strike("act"), strike("off")
+    assert int(np.flatnonzero(rows["guard"] < 1.0)[0]) - first < 50
+    if operator == "none":
+        return  # fed once, it has left for its speed limit before the wall could be felt again
+    after = slice(first + 200, first + 450)
+
+    def given_off(rows: NDArray[np.void]) -> float:
+        return float(np.maximum(rows["force_applied"][:-1] * np.diff(rows["y"]), 0.0)[after].sum())
+
+    assert given_off(rows) < 0.25 * given_off(alone)
+    if operator in ("finger", "grip"):
+        ripple = sosfilt(made()["sections"][0], rows["force_applied"])[after]
+        assert math.sqrt(float((ripple**2).mean())) < 0.1 * 0.08  # 0.1 N at 80 mm
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("operator", LIMITS)
+def test_quiet_walls_are_left_alone(operator: str) -> None:
+    for law, k in (("damped", 0.002), ("half_sample", 0.2), ("mean_force", 0.3)):
+        for speed in (0.2, 0.5, 1.0):
+            settings = struck(operator, "act", law, k, speed)
+            assert (simulate(settings, cycles_of(settings)).rows["guard"] == 1.0).all()
