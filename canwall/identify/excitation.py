@@ -118,8 +118,8 @@ class Excitation:
         """Break the handle loose at several places, in both directions."""
         limit = self.bounds.torque_nm
         cycles = round(_RAMP_S / self._period)
-        # A quarter of the torque in each ramp; friction of a servo is far below.
-        slope = 0.25 * limit / cycles
+        # A tenth of the torque in each ramp; friction of a servo is far below.
+        slope = 0.1 * limit / cycles
         freed = 3.0 * 2.0 * math.pi / 4096.0
         for k in range(_RAMPS):
             yield from self._zero(_REST_S)

@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 
 #: Deviation of the inertia or of 0x6077 that is said to be one.
 _DEVIATES = 0.1
+#: Length of the moving average with which 0x6077 is compared [cycles].
+_SLOW_CYCLES = 200
 #: Part of the cycle above which delay and lag of the drive cost stiffness and are called slow.
 _SLOW = 0.15
 
@@ -103,13 +105,12 @@ def remarks(found: Identified, settings: Settings, inertia: float | None = None)
 def torque_actual_gain(measured: Measured, servo: ServoFit) -> float | None:
     """Return 0x6077 over the commanded torque, None if the drive does not report it.
 
-    A slow torque is compared: a moving average over ten cycles and more makes lags small.
+    Slow torques are compared: a moving average makes lags small.
     """
     actual, sent = measured.torque_actual, measured.torque
     if np.array_equal(actual[1:], sent[:-1]) or not np.any(actual):
         return None
-    length = max(10, math.ceil(10.0 * servo.total.value))
-    window = np.ones(length) / length
+    window = np.hanning(_SLOW_CYCLES)
     late = round(servo.total.value)
     shown = np.convolve(actual[late:], window, "valid")
     wanted = np.convolve(sent[: len(sent) - late], window, "valid")
@@ -173,10 +174,9 @@ def write_report(found: Identified, settings: Settings, inertia: float | None = 
 
 
 def _line(name: str, estimate: Estimate, unit: str) -> str:
-    """Return a line with as many digits as the interval has."""
+    """Return a line with the value and its interval."""
     low, high = estimate.low, estimate.high
-    name_of = name if name.startswith(" ") else f"{name}"
-    return f"{name_of}: {estimate.value:.4g} {unit}".rstrip() + f" [{low:.4g}, {high:.4g}]"
+    return f"{name}: {estimate.value:.4g} {unit}".rstrip() + f" [{low:.4g}, {high:.4g}]"
 
 
 def _hand_lines(hand: HandFit) -> list[str]:
@@ -189,11 +189,9 @@ def _hand_lines(hand: HandFit) -> list[str]:
 
 
 def _stiction_line(found: Identified) -> str:
-    if found.stiction is None or len(found.stiction) < 4:
+    if found.stiction is None:
         return "stiction: the handle did not break loose often enough to tell"
-    holding = found.stiction
-    half = 2.0 * float(holding.std(ddof=1)) / math.sqrt(len(holding))
-    return _line("stiction", Estimate(float(holding.mean()), half), "N·m")
+    return _line("stiction", found.stiction, "N·m")
 
 
 def _cogging_line(servo: ServoFit) -> str:
