@@ -43,11 +43,13 @@ _OUTLIER = 5.0
 _BLOCKS, _T_95 = 16, 2.131
 #: Share of the residuals that a shaft has to explain, and its coefficient in standard errors.
 _SHAFT_EXPLAINS, _SHAFT_SIGNIFICANCE = 0.03, 6.0
+#: Share of the motion that has to be explained, and largest relative half of the inertia's interval.
+_EXPLAINED, _UNCERTAIN = 0.98, 0.1
 #: Largest delay and lag in a fit [periods].
 _MOST_DELAY, _MOST_LAG = 4.0, 3.0
-#: Errors of the model that no residual shows: delay [periods] and lag (relative), which a shaft
-#: makes harder to tell apart.
-_APART, _APART_ELASTIC = (0.008, 0.05), (0.02, 0.12)
+#: Errors of the model that no residual shows: of the delay [periods], of the lag (relative) and of
+#: their sum [periods]; a shaft makes it harder to tell them apart.
+_APART, _APART_ELASTIC = (0.008, 0.05, 0.003), (0.02, 0.12, 0.006)
 #: Lags over which the residuals' autocorrelation is reported.
 _CORRELATED = 5
 
@@ -330,7 +332,18 @@ def fit_servo(position: Array, torque: Array, period: float, step: float) -> Ser
         _check_amount(first[sound], sign[sound])
         whole = fit(sound, ringing)
         x = whole.refined(x)
-    return whole.result(x, 1.0 - float(np.mean(sound)))
+    found = whole.result(x, 1.0 - float(np.mean(sound)))
+    _check_told(found)
+    return found
+
+
+def _check_told(found: ServoFit) -> None:
+    explained, uncertain = found.residuals.explained, found.inertia.half / found.inertia.value
+    if explained < _EXPLAINED or uncertain > _UNCERTAIN:
+        raise UntellingDataError(
+            f"a free handle does not move like this: {explained:.1%} of the motion is explained, "
+            f"the inertia is known to {uncertain:.0%}; let it go, and see that nothing pulls at it"
+        )
 
 
 def _check_amount(first: NDArray[np.int64], sign: Array) -> None:
@@ -418,7 +431,7 @@ class _Fit:
         """Return the parameters of the driven motion, and the residuals [steps]."""
         columns = self._without(self._basis, self._driven(x))
         normal, right = columns.T @ columns, columns.T @ self._target
-        linear = np.asarray(np.linalg.solve(normal, right), float)
+        linear = np.asarray(np.linalg.lstsq(normal, right, rcond=None)[0], float)
         return linear, (self._target - columns @ linear) / self._step
 
     def _misses(self, x: Array) -> Array:
@@ -500,7 +513,7 @@ class _Fit:
             change = self._driven(up) - self._driven(down)
             slopes.append(self._without(basis, change @ linear[: change.shape[1]] / (2.0 * h)))
         jacobian = np.column_stack([*slopes, reduced]) / self._step
-        scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+        scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-100)
         jacobian /= scale
         bread = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-13, hermitian=True)
         samples = self._measured.size
@@ -555,7 +568,7 @@ class _Fit:
             estimate(lambda p: 0.5 * float((p[at + 1] + p[at + 2]) / p[n]), 0.005, force),
             estimate(lambda p: float(p[0] - p[1]), 0.0, apart[0]),
             estimate(lambda p: float(p[1]) * self._period, apart[1], 0.002 * self._period),
-            estimate(lambda p: float(p[0]), 0.0, 0.003),
+            estimate(lambda p: float(p[0]), 0.0, apart[2]),
             shaft,
             cogging,
             self._residuals(left, left_out),
@@ -641,8 +654,8 @@ def break_away(
         if rate == 0.0:
             continue
         took = (6.0 * 3.0 * step * inertia / abs(rate)) ** (1.0 / 3.0)
-        late = 0.5 * took + max(delay - 1.0, 0.0) * period
-        found.append((rest, torque[at - 1] - rate * late, 0.5 * abs(rate) * took))
+        late = 0.5 * took + (delay - 1.0) * period
+        found.append((rest, torque[at - 1] - rate * late, 0.5 * abs(rate) * (took + period)))
     place, loose, error = np.array(found).reshape(-1, 3).T
     return place, loose, error
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from identify.servo_bench import Truth, play, random_servo
+from servo_bench import Truth, play, random_servo
 
 from canwall.identify import Estimate, ServoFit, fit_servo
 from canwall.identify.excitation import Excitation
