@@ -32,7 +32,9 @@ def test_response_is_that_of_scipy() -> None:
     held = np.concatenate([np.zeros(round(1.3 * fine)), np.repeat(torque, fine)])[: 60 * fine]
     time = np.arange(60 * fine) * PERIOD / fine
     for column, denominator in enumerate(([1.0, 0.0, 0.0], [1.0, 2.0 * zeta * omega, omega**2])):
-        _, expected, _ = lsim(([1.0], np.polymul([lag, 1.0], denominator)), held, time, interp=False)
+        _, expected, _ = lsim(
+            ([1.0], np.polymul([lag, 1.0], denominator)), held, time, interp=False
+        )
         scale = np.abs(expected).max()
         assert response[:, column] / scale == pytest.approx(expected[::fine] / scale, abs=1e-5)
 
