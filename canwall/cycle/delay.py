@@ -160,7 +160,7 @@ def measured_delay(position: Array, torque: Array, period: float, mechanics: Mec
         inside = np.clip(guess, low + 1e-6, high - 1e-6)
         fit = least_squares(misses, inside, bounds=(low, high), x_scale=0.1)
         if _rms(fit.fun) ** 2 < 1.0 - _EXPLAINED:
-            delay = Delay(float(fit.x[-1]), _half_interval(fit.jac, fit.fun))
+            delay = Delay(float(fit.x[-1]), _half_interval(np.asarray(fit.jac), fit.fun))
             if delay.half <= _UNCERTAIN:
                 return delay
             raise ValueError(

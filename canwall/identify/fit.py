@@ -43,7 +43,8 @@ _OUTLIER = 5.0
 _BLOCKS, _T_95 = 16, 2.131
 #: Share of the residuals that a shaft has to explain, and its coefficient in standard errors.
 _SHAFT_EXPLAINS, _SHAFT_SIGNIFICANCE = 0.03, 6.0
-#: Share of the motion that has to be explained, and largest relative half of the inertia's interval.
+#: Share of the motion that has to be explained, and largest relative half of the interval of the
+#: inertia.
 _EXPLAINED, _UNCERTAIN = 0.98, 0.1
 #: Largest delay and lag in a fit [periods].
 _MOST_DELAY, _MOST_LAG = 4.0, 3.0

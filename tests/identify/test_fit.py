@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 import pytest
+from scipy.signal import lsim
 from servo_bench import Truth, free_settings, play
 from thirty_servos import AIMS, compared, error, identified
-from scipy.signal import lsim
 
 from canwall.identify import UntellingDataError, fit_servo
 from canwall.identify.excitation import Excitation
@@ -124,6 +124,9 @@ def test_hand_at_the_handle_is_refused() -> None:
     def hand(k: int, y: float, v: float) -> float:
         return 0.8 * (wander[k] - y) - 0.02 * v
 
-    with pytest.raises(UntellingDataError):
+    def identify() -> None:
         position, torque = play(settings, Truth(), Excitation(settings, 1.9), hand)
         fit_servo(position, torque, PERIOD, COUNT)
+
+    with pytest.raises(UntellingDataError):
+        identify()
