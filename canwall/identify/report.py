@@ -35,8 +35,7 @@ def report_lines(found: Identified, settings: Settings, inertia: float | None = 
     """
     if found.hand is not None:
         return _hand_lines(found.hand)
-    assert found.servo is not None
-    servo, measured = found.servo, found.measured
+    servo, measured = _of_servo(found)
     lines = [
         _line("inertia", servo.inertia, "kg·m²"),
         _line("viscous friction", servo.viscous, "N·m·s/rad"),
@@ -71,8 +70,8 @@ def report_lines(found: Identified, settings: Settings, inertia: float | None = 
 
 def remarks(found: Identified, settings: Settings, inertia: float | None = None) -> list[str]:
     """Return what is out of the ordinary."""
-    servo, said = found.servo, []
-    assert servo is not None
+    servo, measured = _of_servo(found)
+    said = []
     if inertia is not None:
         scale = Estimate(
             inertia / servo.inertia.value, inertia * servo.inertia.half / servo.inertia.value**2
@@ -91,10 +90,10 @@ def remarks(found: Identified, settings: Settings, inertia: float | None = None)
                 f"the inertia is {ratio:.2f} times that of [mechanics]: if that one is known well, "
                 f"the torque constant is off by {1.0 / ratio:.2f}; --inertia tells"
             )
-    gain = torque_actual_gain(found.measured, servo)
+    gain = torque_actual_gain(measured, servo)
     if gain is not None and abs(gain - 1.0) > _DEVIATES:
         said.append(f"0x6077 shows {gain:.2f} times the commanded torque")
-    own = servo.lag.value / found.measured.period
+    own = servo.lag.value / measured.period
     if own > _SLOW:
         said.append(
             f"the current loop is slow: its lag is {own:.2f} of a cycle, which a law has to know"
@@ -121,8 +120,7 @@ def toml_fragment(found: Identified) -> str:
     """Return what was found as sections of a configuration."""
     if found.hand is not None:
         return ""
-    servo = found.servo
-    assert servo is not None
+    servo, _ = _of_servo(found)
     lines = [
         "[mechanics]               # the free handle; a hand adds to it",
         f"inertia_kg_m2 = {servo.inertia.value:.4g}",
@@ -171,6 +169,12 @@ def write_report(found: Identified, settings: Settings, inertia: float | None = 
     except OSError as error:
         raise RecordError(f"{folder}: {error.strerror}") from None
     return paths
+
+
+def _of_servo(found: Identified) -> tuple[ServoFit, Measured]:
+    assert found.servo is not None
+    assert found.measured is not None
+    return found.servo, found.measured
 
 
 def _line(name: str, estimate: Estimate, unit: str) -> str:
@@ -237,8 +241,7 @@ def _json_content(found: Identified) -> dict[str, Any]:
 
 def draw(found: Identified, path: Path) -> None:
     """Draw measured and modelled motion, what is left, cogging and break-away torques."""
-    servo, measured = found.servo, found.measured
-    assert servo is not None
+    servo, measured = _of_servo(found)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(12, 7.5), layout="constrained", dpi=120)
         (motion, left), (cogging, whole) = figure.subplots(2, 2)

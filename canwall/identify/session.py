@@ -54,14 +54,14 @@ class Identified:
 
     Attributes:
         result: The run and its folder.
-        measured: Positions and torques.
+        measured: Positions and torques; None if it was stopped or tripped.
         servo: The fit; None if it was stopped, or with a hand on the handle.
         stiction: Torque that holds the handle at rest [N·m]; None if it hardly broke loose.
         hand: The operator, if he held the handle.
     """
 
     result: RunResult
-    measured: Measured
+    measured: Measured | None = None
     servo: ServoFit | None = None
     stiction: Estimate | None = None
     hand: HandFit | None = None
@@ -153,9 +153,9 @@ def identify(
         experiment,
     )
     outcome = result.outcome
-    measured = made[0].measured()
     if outcome.trips or outcome.interrupted:
-        return Identified(result, measured)
+        return Identified(result)
+    measured = made[0].measured()
     report("fitting")
     if with_hand:
         hand = fit_hand(measured.position, measured.torque, measured.period, settings)
