@@ -77,7 +77,7 @@ class Estimator(Section):
             takes effect, in cycles. Default: 1 with synchronous PDOs; measured with others.
         measure_delay: Always measure the delay before the wall is rendered.
         measure_torque_nm: Amplitude of the small torques of the measurement.
-        measure_cycles: Duration of the measurement.
+        measure_cycles: Duration of each of its two parts.
     """
 
     force_walk_nm_per_sqrt_s: Annotated[Positive, Field(ge=1e-4, le=100.0)] | None = None

@@ -3,10 +3,16 @@
 Drives do not report it. Pairs of small opposite torques of random sign excite the motor; D, mass,
 friction and spring are fitted so that the exact motion under these torques comes closest to the
 measured one. Positions are compared after subtraction of their moving average, which removes the
-slow motion of a hand.
+slow motion of a hand. What a hand does faster than that shows in the residuals, and in two
+measurements that differ; then nothing is concluded.
+
+A law pays for too little delay in its model with several times the stiffness that too much costs
+(theory, section 8): the upper end of the 95 % interval is what the axis gets.
 """
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +31,15 @@ Array = NDArray[np.float64]
 
 #: The torques are random but the same in every run.
 _SEED = 402
+#: Measurements, and rest before each but the first [cycles].
+_REPEATED, _REST = 2, 50
 #: Share of the motion that the model has to explain for a delay to be accepted.
-_EXPLAINED = 0.5
+_EXPLAINED = 0.8
+#: Parts of a measurement whose errors count as independent, and Student's t for 95 %.
+_BLOCKS, _T_95 = 8, 2.365
+#: Largest half of the interval, and difference of two measurements beyond their intervals
+#: [periods].
+_UNCERTAIN, _DIFFERENCE = 0.1, 0.02
 #: Initial values of the delay in the fit [periods].
 _GUESSES = np.arange(0.0, MAX_DELAY + 0.1, 0.5)
 #: Travel of the handle under a pair of torques [rad]: many counts, yet hardly felt by a hand.
@@ -35,19 +48,33 @@ _TRAVEL_RAD = 0.01
 _LONGEST, _AVERAGED = 8, 33
 
 
+@dataclass(frozen=True)
+class Delay:
+    """A measured delay D and half of its 95 % interval [periods]."""
+
+    value: float
+    half: float
+
+
 class DelayTest:
-    """Excitation of one axis, and its response."""
+    """Excitation of one axis, and its response, repeated after a rest."""
 
     def __init__(self, axis: WallAxis) -> None:
         settings = axis.settings
         self.axis = axis
-        self.cycles = settings.estimator.measure_cycles
+        cycles = settings.estimator.measure_cycles
         torque = min(settings.estimator.measure_torque_nm, settings.limits.torque_nm)
         # A torque f for n periods, then -f for n periods, moves the handle by f·(nT)²/m.
         farthest = _TRAVEL_RAD * settings.mechanics.inertia_kg_m2 / settings.bus.cycle_s**2
         length = min(max(1, math.floor(math.sqrt(farthest / torque))), _LONGEST)
         per_mille = min(torque, farthest) / float(axis.cycle["nm_per_mille"][0])
-        self._torques = max(1, math.floor(per_mille)) * excitation(self.cycles, length)
+        amplitude = max(1, math.floor(per_mille))
+        starts = [k * (cycles + _REST) for k in range(_REPEATED)]
+        self._parts = [slice(start, start + cycles) for start in starts]
+        self.cycles = starts[-1] + cycles
+        self._torques = np.zeros(self.cycles, np.int64)
+        for k, part in enumerate(self._parts):
+            self._torques[part] = amplitude * excitation(cycles, length, _SEED + k)
         self._positions: list[float] = []
         self._forces: list[float] = []
 
@@ -64,33 +91,53 @@ class DelayTest:
         self._forces.append(float(row["torque_cmd"]))
 
     def conclude(self) -> None:
-        """Set D of the axis. Raises ExperimentError if the torques do not explain the motion."""
+        """Set D of the axis, at the upper end of its interval. Raises ExperimentError."""
         axis = self.axis
-        settings = axis.settings
         try:
-            axis.delay = measured_delay(
-                np.array(self._positions),
-                np.array(self._forces),
-                settings.bus.cycle_s,
-                settings.mechanics,
-            )
-            set_delay(axis.cycle, settings, axis.delay)
+            delay = self.measured()
         except ValueError as error:
             raise ExperimentError(axis, str(error)) from None
+        axis.delay = min(delay.value + delay.half, float(MAX_DELAY))
+        set_delay(axis.cycle, axis.settings, axis.delay)
+
+    def measured(self) -> Delay:
+        """Return D. Raises ValueError if the motion does not tell it."""
+        settings = self.axis.settings
+        position, force = np.array(self._positions), np.array(self._forces)
+        period = settings.bus.cycle_s
+        found = [
+            measured_delay(position[part], force[part], period, settings.mechanics)
+            for part in self._parts
+        ]
+        return agreed_delay(found)
 
 
-def excitation(cycles: int, length: int) -> NDArray[np.int64]:
+def agreed_delay(found: Sequence[Delay]) -> Delay:
+    """Return the mean of delays that agree. Raises ValueError if they do not."""
+    values = [delay.value for delay in found]
+    apart = max(values) - min(values)
+    if apart > sum(delay.half for delay in found) + _DIFFERENCE:
+        shown = " and ".join(f"{value:.3f}" for value in values)
+        raise ValueError(
+            f"the delay cannot be measured: {shown} cycles were found one after the other; let "
+            f"the handle go, or set estimator.delay_cycles"
+        )
+    half = math.sqrt(sum(delay.half**2 for delay in found)) / len(found)
+    return Delay(sum(values) / len(values), max(half, 0.5 * apart))
+
+
+def excitation(cycles: int, length: int, seed: int = _SEED) -> NDArray[np.int64]:
     """Return signs of the torque, shape (cycles,), in pairs that leave the handle at rest.
 
     Each torque of a pair lasts for `length` cycles; an incomplete pair at the end is left out.
     """
-    signs = np.random.default_rng(_SEED).choice([-1, 1], size=cycles // (2 * length))
+    signs = np.random.default_rng(seed).choice([-1, 1], size=cycles // (2 * length))
     pairs = np.stack([signs, -signs], axis=1).reshape(-1).repeat(length)
     return np.concatenate([pairs, np.zeros(cycles - len(pairs))]).astype(np.int64)
 
 
-def measured_delay(position: Array, torque: Array, period: float, mechanics: Mechanics) -> float:
-    """Return D in periods from positions [rad] at each SYNC and torques [N·m] commanded after it.
+def measured_delay(position: Array, torque: Array, period: float, mechanics: Mechanics) -> Delay:
+    """Return D from positions [rad] at each SYNC and torques [N·m] commanded after it.
 
     Both have shape (n,); a missing position is NaN. The fit starts from `mechanics`, at rest in the
     first position. Raises ValueError if the torques do not explain the motion.
@@ -113,11 +160,33 @@ def measured_delay(position: Array, torque: Array, period: float, mechanics: Mec
         inside = np.clip(guess, low + 1e-6, high - 1e-6)
         fit = least_squares(misses, inside, bounds=(low, high), x_scale=0.1)
         if _rms(fit.fun) ** 2 < 1.0 - _EXPLAINED:
-            return float(fit.x[-1])
+            delay = Delay(float(fit.x[-1]), _half_interval(np.asarray(fit.jac), fit.fun))
+            if delay.half <= _UNCERTAIN:
+                return delay
+            raise ValueError(
+                f"the delay cannot be measured: {delay.value:.2f} ± {delay.half:.2f} cycles are "
+                f"too uncertain; let the handle go, give more estimator.measure_torque_nm, or "
+                f"set estimator.delay_cycles"
+            )
     raise ValueError(
         "the delay cannot be measured: the handle does not follow small torques; let it go, "
         "give more estimator.measure_torque_nm, or set estimator.delay_cycles"
     )
+
+
+def _half_interval(slopes: Array, left: Array) -> float:
+    """Return half of the 95 % interval of the last parameter.
+
+    Residuals may be correlated in any way within each of _BLOCKS parts (a cluster-robust estimate,
+    Liang and Zeger 1986).
+    """
+    # A parameter at its bound is not uncertain.
+    free = np.linalg.norm(slopes, axis=0) > 0.0
+    free[-1] = True
+    slopes = slopes[:, free]
+    inverse = np.linalg.pinv(slopes)[-1]
+    parts = np.array([part.sum() for part in np.array_split(inverse * left, _BLOCKS)])
+    return _T_95 * math.sqrt(float(np.sum(parts**2)) * _BLOCKS / (_BLOCKS - 1.0))
 
 
 def _fast(signal: Array) -> Array:

@@ -29,6 +29,8 @@ _REVERSAL_S, _FASTEST_SWEEP_S = 0.15, 0.25
 _SWEEPS = ((1.0, 10.0), (0.5, 9.0), (0.2, 8.0), (0.07, 6.0))
 #: Change of the speed by the signal on top, as a part of that of the sweep.
 _RIPPLE = 0.3
+#: Largest torque of the signal on top, as a part of the largest one.
+_ON_TOP = 0.7
 #: Duration of a ramp, of the rest before it, and their number [s].
 _RAMP_S, _REST_S, _RAMPS = 0.35, 0.15, 16
 #: Travel beyond which a handle is not where the reference wants it, as a part of the limits.
@@ -83,6 +85,8 @@ class Excitation:
         self._largest = torque_nm
         self._period = settings.bus.cycle_s
         self._random = np.random.default_rng(_SEED)
+        # Made here: no cycle waits for it.
+        self._signals = [self._signal(round(seconds / self._period)) for _, seconds in _SWEEPS]
         self._torques: Iterator[float] | None = None
         self._position = self._speed = self._moved = 0.0
         #: Mean square of the change of the speed from cycle to cycle, and the gain against it.
@@ -109,17 +113,16 @@ class Excitation:
 
     def _all(self) -> Iterator[float]:
         yield from self._ramps()
-        for part, seconds in _SWEEPS:
-            speed = part * self.bounds.speed_rad_s
-            yield from self._sweep(speed, seconds)
+        for (part, _), signal in zip(_SWEEPS, self._signals, strict=True):
+            yield from self._sweep(part * self.bounds.speed_rad_s, signal)
         yield from self._follow(0.0, 2.0 * _REST_S)
 
     def _ramps(self) -> Iterator[float]:
         """Break the handle loose at several places, in both directions."""
         limit = self.bounds.torque_nm
         cycles = round(_RAMP_S / self._period)
-        # A quarter of the torque in each ramp; friction of a servo is far below.
-        slope = 0.25 * limit / cycles
+        # A tenth of the torque in each ramp; friction of a servo is far below.
+        slope = 0.1 * limit / cycles
         freed = 3.0 * 2.0 * math.pi / 4096.0
         for k in range(_RAMPS):
             yield from self._zero(_REST_S)
@@ -157,14 +160,16 @@ class Excitation:
         for _ in range(round(seconds / self._period)):
             yield self._loop(self._position, speed)
 
-    def _sweep(self, speed: float, seconds: float) -> Iterator[float]:
-        """Sweep to and fro; half of the time under pairs, half under a multisine."""
+    def _sweep(self, speed: float, signal: list[float]) -> Iterator[float]:
+        """Sweep to and fro under a signal that changes the speed by a part of it."""
         period, travel = self._period, self.bounds.travel_rad
-        cycles = round(seconds / period)
-        on_top = self._signal(cycles, _RIPPLE * speed)
+        limit = self.bounds.torque_nm
+        most = _ON_TOP * limit
+        mass = self._settings.mechanics.inertia_kg_m2
+        amplitude = min(_RIPPLE * speed * mass / period, most)
         rate = speed / _REVERSAL_S
         reference, moving, direction = self._position, 0.0, 1.0
-        for j in range(cycles):
+        for one in signal:
             offset = reference - self._start
             stopping = 0.5 * moving * moving / rate
             if direction * offset > travel - stopping:
@@ -174,27 +179,23 @@ class Excitation:
             # A shaft may swing, and the inertia be far less than that of the configuration.
             self._gain *= 0.995 if self._jolt > (_RIPPLE * speed) ** 2 else 1.001
             self._gain = min(self._gain, 1.0)
-            wanted = self._loop(reference, moving) + self._gain * on_top[j]
-            limit = self.bounds.torque_nm
+            on_top = min(max(amplitude * one, -most), most)
+            wanted = self._loop(reference, moving) + self._gain * on_top
             yield min(max(wanted, -limit), limit)
 
-    def _signal(self, cycles: int, ripple: float) -> Array:
-        """Return pairs and a multisine that change the speed by about `ripple`, shape (cycles,)."""
-        most = 0.7 * self.bounds.torque_nm
-        mass = self._settings.mechanics.inertia_kg_m2
-        amplitude = min(ripple * mass / self._period, most)
-        half = cycles // 2
-        signs = self._random.choice([-1.0, 1.0], size=half // 2)
-        pairs = amplitude * np.stack([signs, -signs], axis=1).reshape(-1)
+    def _signal(self, cycles: int) -> list[float]:
+        """Return pairs in the first half of the cycles, a multisine in the second, about 1 high."""
+        signs = self._random.choice([-1.0, 1.0], size=cycles // 4)
+        pairs = np.stack([signs, -signs], axis=1).reshape(-1)
         # Equal amplitudes up to the Nyquist frequency, random phases, period of about a second.
         n = cycles - len(pairs)
         length = min(n, max(64, round(1.0 / self._period)))
         frequencies = np.fft.rfftfreq(length, self._period)
         spectrum = np.exp(2j * np.pi * self._random.uniform(size=len(frequencies)))
         spectrum[frequencies < 0.02 / self._period] = 0.0
-        one = np.fft.irfft(spectrum, length)
-        tones = np.resize(np.clip(amplitude * one / one.std() / 1.5, -most, most), n)
-        return np.concatenate([pairs, tones])
+        tones = np.fft.irfft(spectrum, length)
+        repeated = np.resize(tones / tones.std() / 1.5, n)
+        return [*pairs.tolist(), *repeated.tolist()]
 
     def _loop(self, position: float, speed: float) -> float:
         """Return the torque that leads the handle to the reference."""

@@ -43,8 +43,14 @@ _OUTLIER = 5.0
 _BLOCKS, _T_95 = 16, 2.131
 #: Share of the residuals that a shaft has to explain, and its coefficient in standard errors.
 _SHAFT_EXPLAINS, _SHAFT_SIGNIFICANCE = 0.03, 6.0
+#: Share of the motion that has to be explained, and largest relative half of the interval of the
+#: inertia.
+_EXPLAINED, _UNCERTAIN = 0.98, 0.1
 #: Largest delay and lag in a fit [periods].
 _MOST_DELAY, _MOST_LAG = 4.0, 3.0
+#: Errors of the model that no residual shows: of the delay [periods], of the lag (relative) and of
+#: their sum [periods]; a shaft makes it harder to tell them apart.
+_APART, _APART_ELASTIC = (0.008, 0.05, 0.003), (0.02, 0.12, 0.006)
 #: Lags over which the residuals' autocorrelation is reported.
 _CORRELATED = 5
 
@@ -93,8 +99,8 @@ class Residuals:
 
     @property
     def white(self) -> bool:
-        """True if the residuals are as small as the encoder's step, or without correlation."""
-        return bool(self.rms < 0.5 or np.abs(self.correlation).max() < 0.2)
+        """True if the residuals have hardly any correlation."""
+        return bool(np.abs(self.correlation).max() < 0.2)
 
 
 @dataclass(frozen=True)
@@ -217,9 +223,11 @@ def torque_response(
     a[4, 0], a[4, 3], a[4, 4] = 1.0, -(omega**2), -2.0 * damping_ratio * omega
     whole = math.floor(delay)
     share = delay - whole
-    parts = [expm(a * part * period)[:5] for part in (share, 1.0 - share)]
+    first, second = (
+        np.ascontiguousarray(expm(a * part * period)[:5]) for part in (share, 1.0 - share)
+    )
     response = np.empty((len(torque), 2))
-    _respond(*(np.ascontiguousarray(part) for part in parts), whole, torque, response)
+    _respond(first, second, whole, torque, response)
     return response
 
 
@@ -325,7 +333,18 @@ def fit_servo(position: Array, torque: Array, period: float, step: float) -> Ser
         _check_amount(first[sound], sign[sound])
         whole = fit(sound, ringing)
         x = whole.refined(x)
-    return whole.result(x, 1.0 - float(np.mean(sound)))
+    found = whole.result(x, 1.0 - float(np.mean(sound)))
+    _check_told(found)
+    return found
+
+
+def _check_told(found: ServoFit) -> None:
+    explained, uncertain = found.residuals.explained, found.inertia.half / found.inertia.value
+    if explained < _EXPLAINED or uncertain > _UNCERTAIN:
+        raise UntellingDataError(
+            f"a free handle does not move like this: {explained:.1%} of the motion is explained, "
+            f"the inertia is known to {uncertain:.0%}; let it go, and see that nothing pulls at it"
+        )
 
 
 def _check_amount(first: NDArray[np.int64], sign: Array) -> None:
@@ -412,7 +431,8 @@ class _Fit:
     def _solved(self, x: Array) -> tuple[Array, Array]:
         """Return the parameters of the driven motion, and the residuals [steps]."""
         columns = self._without(self._basis, self._driven(x))
-        linear = np.linalg.solve(columns.T @ columns, columns.T @ self._target)
+        normal, right = columns.T @ columns, columns.T @ self._target
+        linear = np.asarray(np.linalg.lstsq(normal, right, rcond=None)[0], float)
         return linear, (self._target - columns @ linear) / self._step
 
     def _misses(self, x: Array) -> Array:
@@ -434,7 +454,7 @@ class _Fit:
             inside,
             bounds=(low, high),
             x_scale=np.maximum(np.abs(inside), 0.05),
-            diff_step=1e-4,
+            diff_step=[1e-4],
             xtol=1e-7,
             max_nfev=20,
         )
@@ -483,7 +503,7 @@ class _Fit:
         columns = np.column_stack([self._driven(x), self._friction])
         reduced = self._without(basis, columns)
         target = self._without(basis, self._measured)
-        linear = np.linalg.lstsq(reduced, target, rcond=None)[0]
+        linear = np.asarray(np.linalg.lstsq(reduced, target, rcond=None)[0], float)
         left = (target - reduced @ linear) / self._step
         slopes = []
         for i in range(len(x)):
@@ -494,7 +514,7 @@ class _Fit:
             change = self._driven(up) - self._driven(down)
             slopes.append(self._without(basis, change @ linear[: change.shape[1]] / (2.0 * h)))
         jacobian = np.column_stack([*slopes, reduced]) / self._step
-        scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+        scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-100)
         jacobian /= scale
         bread = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-13, hermitian=True)
         samples = self._measured.size
@@ -539,6 +559,7 @@ class _Fit:
                 estimate(lambda p: float(p[n + 1] / p[n]), 0.02),
             )
         force = 1e-4 * float(np.abs(self._pieces.torque).max())
+        apart = _APART if shaft is None else _APART_ELASTIC
         one_way = math.hypot(force, 0.03 * float(np.ptp(cogging[1])))
         return ServoFit(
             estimate(lambda p: 1.0 / float(p[n]), 0.002),
@@ -546,9 +567,9 @@ class _Fit:
             estimate(lambda p: float(p[at + 1] / p[n]) + constant, 0.005, one_way),
             estimate(lambda p: float(p[at + 2] / p[n]) - constant, 0.005, one_way),
             estimate(lambda p: 0.5 * float((p[at + 1] + p[at + 2]) / p[n]), 0.005, force),
-            estimate(lambda p: float(p[0] - p[1]), 0.0, 0.005),
-            estimate(lambda p: float(p[1]) * self._period, 0.03, 0.002 * self._period),
-            estimate(lambda p: float(p[0]), 0.0, 0.003),
+            estimate(lambda p: float(p[0] - p[1]), 0.0, apart[0]),
+            estimate(lambda p: float(p[1]) * self._period, apart[1], 0.002 * self._period),
+            estimate(lambda p: float(p[0]), 0.0, apart[2]),
             shaft,
             cogging,
             self._residuals(left, left_out),
@@ -601,26 +622,43 @@ class _Fit:
         return np.stack([at * self._period, measured, model])
 
 
-def break_away(position: Array, torque: Array, step: float) -> tuple[Array, Array]:
+def break_away(
+    position: Array, torque: Array, period: float, step: float, inertia: float, delay: float
+) -> tuple[Array, Array, Array]:
     """Return where and at which torque a handle at rest broke loose, in a record of slow ramps.
 
-    Each ramp begins at zero torque. Both results have the same shape; the sign of a torque is its
-    direction.
+    Each ramp begins at zero torque. A handle that has just broken loose under a torque that rises
+    with r needs (6·s·m/r)^⅓ for its first steps s, or less if friction falls: the torque is that
+    at the middle of this time before they were seen.
 
     Args:
         position: Positions at the SYNCs [rad].
         torque: Torques commanded after them [N·m].
+        period: SYNC period [s].
         step: Step of the encoder [rad].
+        inertia: Inertia of the handle [kg·m²].
+        delay: From sample to torque [periods].
+
+    Returns:
+        Position [rad], torque [N·m], whose sign is its direction, and its uncertainty [N·m], one
+        for each ramp in which the handle broke loose.
     """
-    places, torques = [], []
+    found = []
     starts = np.flatnonzero((torque[1:] != 0.0) & (torque[:-1] == 0.0))
     for start, end in zip(starts, [*starts[1:], len(torque)], strict=True):
         rest = position[start]
         moved = np.flatnonzero(np.abs(position[start:end] - rest) > 3.0 * step)
-        if len(moved) and torque[start + moved[0] - 1] != 0.0:
-            places.append(rest)
-            torques.append(torque[start + moved[0] - 1])
-    return np.array(places), np.array(torques)
+        if not len(moved) or moved[0] < 2:
+            continue
+        at = start + int(moved[0])
+        rate = (torque[at - 1] - torque[start]) / (moved[0] - 1) / period
+        if rate == 0.0:
+            continue
+        took = (6.0 * 3.0 * step * inertia / abs(rate)) ** (1.0 / 3.0)
+        late = 0.5 * took + (delay - 1.0) * period
+        found.append((rest, torque[at - 1] - rate * late, 0.5 * abs(rate) * (took + period)))
+    place, loose, error = np.array(found).reshape(-1, 3).T
+    return place, loose, error
 
 
 def encoder_step(counts: NDArray[np.int64]) -> int:

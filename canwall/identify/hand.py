@@ -98,8 +98,8 @@ def fit_hand(position: Array, torque: Array, period: float, settings: Settings) 
         mechanics.viscous_nm_s_per_rad,
         mechanics.spring_nm_per_rad,
     )
-    estimates = [
+    inertia, damping, stiffness = (
         Estimate(float(value) - part, math.hypot(half, 0.02 * float(value)))
         for value, part, half in zip(values, free, halves, strict=True)
-    ]
-    return HandFit(*estimates, explained)
+    )
+    return HandFit(inertia, damping, stiffness, explained)

@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 
 #: Deviation of the inertia or of 0x6077 that is said to be one.
 _DEVIATES = 0.1
+#: Length of the moving average with which 0x6077 is compared [cycles].
+_SLOW_CYCLES = 200
 #: Part of the cycle above which delay and lag of the drive cost stiffness and are called slow.
 _SLOW = 0.15
 
@@ -33,8 +35,7 @@ def report_lines(found: Identified, settings: Settings, inertia: float | None = 
     """
     if found.hand is not None:
         return _hand_lines(found.hand)
-    assert found.servo is not None
-    servo, measured = found.servo, found.measured
+    servo, measured = _of_servo(found)
     lines = [
         _line("inertia", servo.inertia, "kg·m²"),
         _line("viscous friction", servo.viscous, "N·m·s/rad"),
@@ -69,8 +70,8 @@ def report_lines(found: Identified, settings: Settings, inertia: float | None = 
 
 def remarks(found: Identified, settings: Settings, inertia: float | None = None) -> list[str]:
     """Return what is out of the ordinary."""
-    servo, said = found.servo, []
-    assert servo is not None
+    servo, measured = _of_servo(found)
+    said = []
     if inertia is not None:
         scale = Estimate(
             inertia / servo.inertia.value, inertia * servo.inertia.half / servo.inertia.value**2
@@ -89,10 +90,10 @@ def remarks(found: Identified, settings: Settings, inertia: float | None = None)
                 f"the inertia is {ratio:.2f} times that of [mechanics]: if that one is known well, "
                 f"the torque constant is off by {1.0 / ratio:.2f}; --inertia tells"
             )
-    gain = torque_actual_gain(found.measured, servo)
+    gain = torque_actual_gain(measured, servo)
     if gain is not None and abs(gain - 1.0) > _DEVIATES:
         said.append(f"0x6077 shows {gain:.2f} times the commanded torque")
-    own = servo.lag.value / found.measured.period
+    own = servo.lag.value / measured.period
     if own > _SLOW:
         said.append(
             f"the current loop is slow: its lag is {own:.2f} of a cycle, which a law has to know"
@@ -103,13 +104,12 @@ def remarks(found: Identified, settings: Settings, inertia: float | None = None)
 def torque_actual_gain(measured: Measured, servo: ServoFit) -> float | None:
     """Return 0x6077 over the commanded torque, None if the drive does not report it.
 
-    A slow torque is compared: a moving average over ten cycles and more makes lags small.
+    Slow torques are compared: a moving average makes lags small.
     """
     actual, sent = measured.torque_actual, measured.torque
     if np.array_equal(actual[1:], sent[:-1]) or not np.any(actual):
         return None
-    length = max(10, math.ceil(10.0 * servo.total.value))
-    window = np.ones(length) / length
+    window = np.hanning(_SLOW_CYCLES)
     late = round(servo.total.value)
     shown = np.convolve(actual[late:], window, "valid")
     wanted = np.convolve(sent[: len(sent) - late], window, "valid")
@@ -120,8 +120,7 @@ def toml_fragment(found: Identified) -> str:
     """Return what was found as sections of a configuration."""
     if found.hand is not None:
         return ""
-    servo = found.servo
-    assert servo is not None
+    servo, _ = _of_servo(found)
     lines = [
         "[mechanics]               # the free handle; a hand adds to it",
         f"inertia_kg_m2 = {servo.inertia.value:.4g}",
@@ -172,11 +171,16 @@ def write_report(found: Identified, settings: Settings, inertia: float | None = 
     return paths
 
 
+def _of_servo(found: Identified) -> tuple[ServoFit, Measured]:
+    assert found.servo is not None
+    assert found.measured is not None
+    return found.servo, found.measured
+
+
 def _line(name: str, estimate: Estimate, unit: str) -> str:
-    """Return a line with as many digits as the interval has."""
+    """Return a line with the value and its interval."""
     low, high = estimate.low, estimate.high
-    name_of = name if name.startswith(" ") else f"{name}"
-    return f"{name_of}: {estimate.value:.4g} {unit}".rstrip() + f" [{low:.4g}, {high:.4g}]"
+    return f"{name}: {estimate.value:.4g} {unit}".rstrip() + f" [{low:.4g}, {high:.4g}]"
 
 
 def _hand_lines(hand: HandFit) -> list[str]:
@@ -189,11 +193,9 @@ def _hand_lines(hand: HandFit) -> list[str]:
 
 
 def _stiction_line(found: Identified) -> str:
-    if found.stiction is None or len(found.stiction) < 4:
+    if found.stiction is None:
         return "stiction: the handle did not break loose often enough to tell"
-    holding = found.stiction
-    half = 2.0 * float(holding.std(ddof=1)) / math.sqrt(len(holding))
-    return _line("stiction", Estimate(float(holding.mean()), half), "N·m")
+    return _line("stiction", found.stiction, "N·m")
 
 
 def _cogging_line(servo: ServoFit) -> str:
@@ -239,8 +241,7 @@ def _json_content(found: Identified) -> dict[str, Any]:
 
 def draw(found: Identified, path: Path) -> None:
     """Draw measured and modelled motion, what is left, cogging and break-away torques."""
-    servo, measured = found.servo, found.measured
-    assert servo is not None
+    servo, measured = _of_servo(found)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(12, 7.5), layout="constrained", dpi=120)
         (motion, left), (cogging, whole) = figure.subplots(2, 2)

@@ -11,6 +11,7 @@ from canwall.config import Settings
 from canwall.cycle import ExperimentError, WallAxis
 from canwall.identify.excitation import Excitation, HandExcitation
 from canwall.identify.fit import (
+    Estimate,
     ServoFit,
     UntellingDataError,
     break_away,
@@ -21,6 +22,9 @@ from canwall.identify.hand import HandFit, fit_hand
 from canwall.run import RunResult, run
 
 Array = NDArray[np.float64]
+
+#: Ramps in which the handle has to break loose.
+_FEWEST_RAMPS = 4
 
 
 @dataclass(frozen=True)
@@ -50,16 +54,16 @@ class Identified:
 
     Attributes:
         result: The run and its folder.
-        measured: Positions and torques.
+        measured: Positions and torques; None if it was stopped or tripped.
         servo: The fit; None if it was stopped, or with a hand on the handle.
-        stiction: Torques at which the handle broke loose [N·m], without the cogging there.
+        stiction: Torque that holds the handle at rest [N·m]; None if it hardly broke loose.
         hand: The operator, if he held the handle.
     """
 
     result: RunResult
-    measured: Measured
+    measured: Measured | None = None
     servo: ServoFit | None = None
-    stiction: Array | None = None
+    stiction: Estimate | None = None
     hand: HandFit | None = None
 
 
@@ -149,18 +153,37 @@ def identify(
         experiment,
     )
     outcome = result.outcome
-    measured = made[0].measured()
     if outcome.trips or outcome.interrupted:
-        return Identified(result, measured)
+        return Identified(result)
+    measured = made[0].measured()
     report("fitting")
     if with_hand:
         hand = fit_hand(measured.position, measured.torque, measured.period, settings)
         return Identified(result, measured, hand=hand)
     servo = fit_servo(measured.position, measured.torque, measured.period, measured.step)
-    places, torques = break_away(measured.position, measured.torque, measured.step)
+    return Identified(result, measured, servo, stiction(measured, servo))
+
+
+def stiction(measured: Measured, servo: ServoFit) -> Estimate | None:
+    """Return the torque that holds the handle at rest, None if it hardly ever broke loose."""
+    delay = servo.delay.value
+    place, torque, error = break_away(
+        measured.position,
+        measured.torque,
+        measured.period,
+        measured.step,
+        servo.inertia.value,
+        delay,
+    )
+    if len(place) < _FEWEST_RAMPS:
+        return None
     # Cogging helps or hinders: what holds is the rest.
-    holding = np.abs(torques) - np.sign(torques) * np.interp(places, *servo.cogging)
-    return Identified(result, measured, servo, holding)
+    holds = np.abs(torque) - np.sign(torque) * np.interp(place, *servo.cogging)
+    # A constant torque helps one way as much as it hinders the other.
+    ways = [holds[torque > 0.0], holds[torque < 0.0]]
+    value = float(np.mean([way.mean() for way in ways if len(way)]))
+    scatter = 2.0 * float(holds.std(ddof=1)) / np.sqrt(len(holds))
+    return Estimate(value, float(np.hypot(scatter, error.mean())))
 
 
 def _without_wall(settings: Settings, duration_s: float) -> Settings:

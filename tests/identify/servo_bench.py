@@ -11,8 +11,8 @@ from rig import settings_with
 from canwall.config import Settings
 
 Array = NDArray[np.float64]
-#: Substeps of a period.
-SUBSTEPS = 50
+#: Substeps of a period; a tick of the drive is as exact as they are short.
+SUBSTEPS = 200
 
 
 @dataclass(frozen=True)

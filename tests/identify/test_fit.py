@@ -1,0 +1,131 @@
+"""Fit of a servo: against servos of its own integration, whose parameters are known."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.signal import lsim
+from servo_bench import Truth, free_settings, play
+from thirty_servos import AIMS, compared, error, identified
+
+from canwall.identify import UntellingDataError, fit_servo
+from canwall.identify.excitation import Excitation
+from canwall.identify.fit import (
+    PIECE,
+    Estimate,
+    break_away,
+    encoder_step,
+    steady_pieces,
+    torque_response,
+)
+
+PERIOD = 1e-3
+COUNT = 2.0 * math.pi / 131072
+
+
+def test_response_is_that_of_scipy() -> None:
+    """Torques delayed by 1.3 periods, through a lag, on an inertia and on a resonance."""
+    torque = np.random.default_rng(1).normal(size=60)
+    lag, omega, zeta = 2e-4, 2.0 * math.pi * 300.0, 0.03
+    response = torque_response(torque, PERIOD, 1.3, lag, 300.0, zeta)
+    fine = 50
+    held = np.concatenate([np.zeros(round(1.3 * fine)), np.repeat(torque, fine)])[: 60 * fine]
+    time = np.arange(60 * fine) * PERIOD / fine
+    for column, denominator in enumerate(([1.0, 0.0, 0.0], [1.0, 2.0 * zeta * omega, omega**2])):
+        _, expected, _ = lsim(
+            ([1.0], np.polymul([lag, 1.0], denominator)), held, time, interp=False
+        )
+        scale = np.abs(expected).max()
+        assert response[:, column] / scale == pytest.approx(expected[::fine] / scale, abs=1e-5)
+
+
+def test_pieces_keep_their_direction() -> None:
+    time = np.arange(2000) * PERIOD
+    position = np.sin(2.0 * np.pi * time)
+    position[100] = np.nan
+    first, sign = steady_pieces(position, PERIOD, COUNT)
+    assert len(first) > 40
+    for begin, way in zip(first, sign, strict=True):
+        moved = way * np.diff(position[begin : begin + PIECE])
+        assert (moved > 2.0 * COUNT).all()
+        assert not begin <= 100 < begin + PIECE
+
+
+def test_handle_that_hardly_moves_tells_nothing() -> None:
+    torque = 0.1 * np.random.default_rng(2).normal(size=4000)
+    with pytest.raises(UntellingDataError, match="moved too little"):
+        fit_servo(np.zeros(4000), torque, PERIOD, COUNT)
+
+
+def test_handle_that_something_else_drives_tells_nothing() -> None:
+    time = np.arange(8000) * PERIOD
+    torque = 0.1 * np.random.default_rng(2).normal(size=8000)
+    position = np.round(2.0 * np.sin(3.0 * time) / COUNT) * COUNT
+    with pytest.raises(UntellingDataError):
+        fit_servo(position, torque, PERIOD, COUNT)
+
+
+def test_break_away_of_a_ramp() -> None:
+    """A handle at 0.3 rad that breaks loose at 12 mN·m under 0.2 N·m/s, without other friction."""
+    rate, inertia = 0.2, 1e-4
+    time = np.arange(200) * PERIOD
+    torque = rate * time
+    free = np.maximum(time - 0.06 - PERIOD, 0.0)
+    position = 0.3 + np.round(rate * free**3 / (6.0 * inertia) / COUNT) * COUNT
+    place, loose, uncertain = break_away(position, torque, PERIOD, COUNT, inertia, 1.0)
+    assert place == pytest.approx([0.3])
+    assert loose == pytest.approx([0.012], abs=float(uncertain[0]))
+    assert uncertain[0] < 0.001
+
+
+def test_step_of_an_encoder_that_counts_in_fours() -> None:
+    assert encoder_step(np.array([3, 7, 15, 15, 3], np.int64)) == 4
+
+
+def test_interval() -> None:
+    assert Estimate(1.0, 0.1).contains(1.05)
+    assert not Estimate(1.0, 0.1).contains(1.2)
+
+
+@pytest.mark.slow
+def test_excitation_stays_within_its_bounds() -> None:
+    """Also with an inertia of [mechanics] that is too large by half, and an elastic shaft."""
+    settings = free_settings(1.5e-4)
+    excitation = Excitation(settings, 1.9)
+    truth = Truth(shaft_hz=300.0, drive_cycle=2.5e-4)
+    position, torque = play(settings, truth, excitation)
+    low, high = settings.limits.position_rad
+    assert low < position.min() < -1.5
+    assert 1.5 < position.max() < high
+    assert np.abs(np.diff(position)).max() / PERIOD < settings.limits.speed_rad_s
+    assert np.abs(torque).max() <= excitation.bounds.torque_nm * 1.01
+    assert len(position) * PERIOD <= excitation.duration_s < 60.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [4, 24])
+def test_random_servo(seed: int) -> None:
+    """Two of the thirty: a stiff shaft and an elastic one."""
+    truth, fit = identified(seed)
+    for name, (estimate, true) in compared(truth, fit).items():
+        assert error(name, estimate, true) <= AIMS[name], name
+        assert estimate.contains(true), name
+    assert (fit.shaft is not None) == (truth.shaft_hz > 0.0)
+
+
+@pytest.mark.slow
+def test_hand_at_the_handle_is_refused() -> None:
+    """A hand that holds on, and wanders."""
+    settings = free_settings(1.0e-4)
+    wander = np.convolve(np.random.default_rng(3).normal(size=60_000), np.hanning(300), "same")
+    wander *= 0.3 / wander.std()
+
+    def hand(k: int, y: float, v: float) -> float:
+        return 0.8 * (wander[k] - y) - 0.02 * v
+
+    def identify() -> None:
+        position, torque = play(settings, Truth(), Excitation(settings, 1.9), hand)
+        fit_servo(position, torque, PERIOD, COUNT)
+
+    with pytest.raises(UntellingDataError):
+        identify()

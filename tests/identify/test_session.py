@@ -1,0 +1,121 @@
+"""The command, over the embedded bus: what it finds, writes and refuses, and how it ends."""
+
+import json
+import tomllib
+from pathlib import Path
+
+import pytest
+from commands import command, config_file
+from rig import settings_with
+
+from canwall.config import Settings
+from canwall.errors import ConfigError
+from canwall.identify import identify
+from canwall.identify.excitation import Bounds, HandExcitation
+
+#: Changes of config/sim.toml: nobody at the handle, a real current loop, a model that is off.
+FREE = {
+    "inertia_kg_m2 = 6.4e-5": "inertia_kg_m2 = 0.0",
+    "damping_nm_s_per_rad = 0.0256": "damping_nm_s_per_rad = 0.0",
+    "stiffness_nm_per_rad = 3.2": "stiffness_nm_per_rad = 0.0",
+    "strikes = 4\n": "strikes = 0\n",
+    "current_bandwidth_hz = 0.0": "current_bandwidth_hz = 800.0",
+    "inertia_kg_m2 = 1.64e-4": "inertia_kg_m2 = 1.2e-4",
+}
+#: The hand of config/sim.toml, which rests, on a handle whose [mechanics] are known.
+HELD = {
+    "strikes = 4\n": "strikes = 0\n",
+    "inertia_kg_m2 = 1.64e-4": "inertia_kg_m2 = 1.0e-4",
+    "viscous_nm_s_per_rad = 0.0261": "viscous_nm_s_per_rad = 5.0e-4",
+}
+
+
+def free_handle() -> Settings:
+    settings = settings_with({})
+    assert settings.simulation is not None
+    nobody = {"inertia_kg_m2": 0.0, "damping_nm_s_per_rad": 0.0, "stiffness_nm_per_rad": 0.0}
+    hand = settings.simulation.hand.model_copy(update=nobody | {"strikes": 0})
+    simulation = settings.simulation.model_copy(update={"hand": hand})
+    return settings.model_copy(update={"simulation": simulation})
+
+
+@pytest.mark.slow
+def test_command_finds_the_servo(tmp_path: Path) -> None:
+    """With the true inertia told, which is 1.2 times that in commanded torque."""
+    path = config_file(tmp_path / "servo.toml", FREE)
+    done = command("identify", path, "--inertia", "1.2e-4", "--output", tmp_path / "record")
+    assert done.returncode == 0, done.stderr
+    found = json.loads((tmp_path / "record/identify.json").read_text())
+    truth = {
+        "inertia": 1e-4,
+        "viscous": 5e-4,
+        "coulomb": 0.01,
+        "delay": 1.0,
+        "lag": 1.0 / (2.0 * 3.14159265 * 800.0),
+    }
+    for name, true in truth.items():
+        low, high = found[name]["interval"]
+        assert low <= true <= high, name
+        assert high - low < 0.15 * true, name
+    assert "the torque is 1.20 times the commanded one" in done.stdout
+    assert "the current loop is slow" in done.stdout
+    fragment = tomllib.loads((tmp_path / "record/identify.toml").read_text())
+    assert fragment["mechanics"]["inertia_kg_m2"] == pytest.approx(1e-4, rel=0.01)
+    assert fragment["drive"]["current_bandwidth_hz"] == pytest.approx(800.0, rel=0.05)
+    assert 1.0 <= fragment["estimator"]["delay_cycles"] < 1.02
+    assert (tmp_path / "record/identify.png").stat().st_size > 10_000
+    assert (tmp_path / "record/signals.parquet").exists()
+
+
+@pytest.mark.slow
+def test_command_finds_the_operator(tmp_path: Path) -> None:
+    path = config_file(tmp_path / "servo.toml", HELD)
+    done = command("identify", path, "--hand", "--output", tmp_path / "record")
+    assert done.returncode == 0, done.stderr
+    found = json.loads((tmp_path / "record/identify.json").read_text())
+    for name, true in {"inertia": 6.4e-5, "damping": 0.0256, "stiffness": 3.2}.items():
+        low, high = found[name]["interval"]
+        assert low <= true <= high, name
+        assert high - low < 0.2 * true, name
+
+
+@pytest.mark.slow
+def test_hand_at_the_handle_is_told(tmp_path: Path) -> None:
+    done = command(
+        "identify", config_file(tmp_path / "servo.toml", HELD), "--output", tmp_path / "record"
+    )
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert "let it go" in line
+
+
+@pytest.mark.slow
+def test_stopped_on_the_way(tmp_path: Path) -> None:
+    """Asked in every cycle: the drive is disabled, the record complete, and nothing concluded."""
+    asked = 0
+
+    def stopped() -> bool:
+        nonlocal asked
+        asked += 1
+        return asked > 2000
+
+    found = identify(free_handle(), tmp_path / "record", stopped=stopped)
+    outcome = found.result.outcome
+    assert (outcome.interrupted, outcome.disabled, outcome.trips) == (True, True, [])
+    assert found.servo is None
+    assert found.result.summary["interrupted"]
+
+
+def test_handle_next_to_a_limit_is_refused() -> None:
+    with pytest.raises(ConfigError, match="too near to a limit"):
+        Bounds.of(settings_with({}), 2.9, 1.9)
+
+
+def test_hand_excitation_is_small_and_ends() -> None:
+    settings = settings_with({})
+    excitation = HandExcitation(settings, 1.9)
+    torques = []
+    while (torque := excitation.next(0.0)) is not None:
+        torques.append(torque)
+    assert len(torques) == round(HandExcitation.duration_s / settings.bus.cycle_s)
+    assert max(map(abs, torques)) <= settings.estimator.measure_torque_nm
