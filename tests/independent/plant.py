@@ -384,8 +384,3 @@ def k_limit(
                 return passed, float(normalised)
         passed = float(normalised)
     return passed, math.inf
-
-
-def with_friction(servo: Servo, coulomb: float) -> Servo:
-    """Return the servo with another Coulomb friction."""
-    return servo._replace(coulomb=coulomb)
