@@ -69,12 +69,14 @@ BANK = np.dtype(
 
 #: Evidence against the heavier ones of two filters at the beginning: it is safe to begin light.
 _PRIOR = 0.1
+#: Least difference of the residuals that tells [counts].
+_TELLING = 0.3
 #: Share of the evidence that is left after a sample that tells.
 _MEMORY = 0.995
 #: Normalised square of a residual from which on it counts less: the model is wrong, not the noise.
 _OUTLIER = 25.0
 #: Time without torque after which another hand may be at the handle [s].
-_FORGOTTEN_S = 0.05
+_FORGOTTEN_S = 0.2
 #: Evidence against a filter, beyond that against the best one, up to which it may be right: three
 #: standard deviations.
 _BELIEVABLE = 9.0
@@ -84,8 +86,8 @@ _CERTAIN = 1.3
 _RETURNED = 0.9
 #: Share of the way to the likeliest mass that is gone in a period.
 _FOLLOWED = 0.6
-#: Power of the mass with which the walk of a hand's force falls. The ripple that the encoder's steps
-#: make at the handle grows with mass and bandwidth; so it stays below what is felt for all.
+#: Power of the mass with which the walk of a hand's force falls. What the steps of the encoder make
+#: felt at the handle grows with mass and bandwidth; so it stays below what is felt for all.
 _STEADINESS = 0.8
 #: Time constant at which a light hand's damping equals its inertia [s].
 _HAND_S = 1.5e-3
@@ -188,7 +190,7 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
     moved = _moved(bank, y_sample)
     if _torque_acted(estimator):
         bank.at_rest = 0
-        if moved and most - least > bank.resolution:
+        if moved and most - least > _TELLING * bank.resolution:
             _learn(bank)
             changed = _follow(bank)
     else:

@@ -112,7 +112,7 @@ def test_nothing_is_learned_in_free_motion_nor_at_rest() -> None:
 
 
 def test_hand_is_forgotten_after_the_contact() -> None:
-    torques = np.concatenate([pulses(0.3), np.zeros(60)])
+    torques = np.concatenate([pulses(0.3), np.zeros(210)])
     found = play(*bank_at(0.0), 1.4e-3, torques)
     assert found[100] > 1e-3
     np.testing.assert_allclose(found[-1], MASSES[0], rtol=1e-12)
