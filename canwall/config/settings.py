@@ -72,7 +72,7 @@ class Estimator(Section):
 
     Attributes:
         force_walk_nm_per_sqrt_s: Random walk of the operator's force. Default: 0.2; with
-            operator.adapt 0.01.
+            operator.adapt 0.02 for the lightest hand, and less for heavier ones.
         delay_cycles: Delay D from the sampling of a position until the torque computed from it
             takes effect, in cycles. Default: 1 with synchronous PDOs; measured with others.
         measure_delay: Always measure the delay before the wall is rendered.
@@ -231,6 +231,12 @@ class Settings(Section):
                 f"bus.master_id = {self.bus.master_id} is the drive's own node-ID: no two nodes of "
                 f"a bus may share one"
             )
+        lightest = self.operator.lightest_kg_m2 or self.mechanics.inertia_kg_m2
+        if self.operator.adapt and not lightest < self.operator.heaviest_kg_m2:
+            raise ValueError(
+                f"operator.heaviest_kg_m2 = {self.operator.heaviest_kg_m2:g}: has to be more than "
+                f"the lightest inertia, {lightest:g}; raise it, or lower operator.lightest_kg_m2"
+            )
         if [c.at_s for c in self.schedule] != sorted(c.at_s for c in self.schedule):
             raise ValueError("schedule: the entries have to be in the order of at_s")
         if self.wall.alternate and any(change.law for change in self.schedule):
@@ -267,7 +273,7 @@ class Settings(Section):
         given = self.estimator.force_walk_nm_per_sqrt_s
         if given is not None:
             return given
-        return 0.01 if self.operator.adapt else 0.2
+        return 0.02 if self.operator.adapt else 0.2
 
     @property
     def embedded(self) -> bool:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from canwall.config import Limits, Settings, Wall
 from canwall.cycle.core import DRIVE_FRAMES
-from canwall.cycle.state import SYNCHRONOUS_DELAY, make_cycle
+from canwall.cycle.state import make_cycle, modelled_delay
 from canwall.cycle.timing import HISTOGRAM
 from canwall.cycle.trips import Trip
 from canwall.drive import DriveNode, DriveSetup
@@ -73,7 +73,7 @@ class WallAxis:
         #: Times from a TPDO to its RPDO, and from the instant at which SYNC was due to the RPDO.
         self.latency, self.sync_to_rpdo = np.zeros(1, HISTOGRAM), np.zeros(1, HISTOGRAM)
         given = self.settings.estimator.delay_cycles
-        self.delay = SYNCHRONOUS_DELAY if given is None else given
+        self.delay = modelled_delay(self.settings) if given is None else given
         self.wall, self.limits = self.settings.wall, self.settings.limits
         self.turns = self.settings.laws_in_turn(self.settings.wall)
 

@@ -17,6 +17,7 @@ from canwall.units import to_per_mille
 from canwall.walls import (
     acting_force,
     actuation_state,
+    bounded_push,
     change_plant,
     correct,
     correct_bank,
@@ -141,6 +142,8 @@ def _force_of(cycle: Record, rendered: Record, due: bool) -> float:
         # A law that does not return is named by what looks at this cycle from beside it.
         cycle.evaluated = rendered.law + 1
         rendered.force = wall_force(cycle.laws[rendered.law], rendered.wall[0])
+        if cycle.bank[0].adapts:
+            rendered.force = bounded_push(cycle.bank[0], rendered.wall[0], rendered.force)
         cycle.evaluated = 0
     return cycle.guard[0].factor * rendered.force
 

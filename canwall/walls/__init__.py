@@ -7,6 +7,7 @@ out of it. Nothing here knows of CAN, counts or drives.
 from canwall.walls.bank import (
     BANK,
     MAX_FILTERS,
+    bounded_push,
     correct_bank,
     hand_damping,
     predict_bank,
@@ -62,6 +63,7 @@ __all__ = [
     "UnknownLawError",
     "acting_force",
     "actuation_state",
+    "bounded_push",
     "call_law",
     "change_plant",
     "clear_memory",

@@ -22,6 +22,11 @@ from canwall.walls.estimator import MAX_DELAY, KalmanModel, kalman_model, set_mo
 #: Largest number of filters.
 MAX_FILTERS = 24
 
+#: Number of samples over which the handle has to move for its motion to tell a mass.
+_RECENT = 4
+#: Its least motion over these samples [counts].
+_MOVED = 2.0
+
 #: A bank, in the order of the masses. Gains, covariances and transitions are made beforehand:
 #: nothing of a Riccati equation is left for the cycle.
 BANK = np.dtype(
@@ -51,8 +56,12 @@ BANK = np.dtype(
         ("cost", "f8", (MAX_FILTERS,)),
         ("residual", "f8", (MAX_FILTERS,)),
         ("place", "f8"),
-        ("quiet", "i8"),  # periods without torque
+        ("samples", "f8", (_RECENT,)),  # the last ones, newest first [rad]
+        ("at_rest", "i8"),  # samples without torque in a row
+        ("forgotten", "i8"),  # of those after which the hand may be another one
         ("mass", "f8"),
+        ("least_mass", "f8"),  # lightest that is believable
+        ("approach", "f8"),  # speed of the approach to the present contact [rad/s]
         ("spread", "f8"),  # standard deviation of ln(mass), as far as the residuals tell
     ],
     align=True,
@@ -60,12 +69,26 @@ BANK = np.dtype(
 
 #: Evidence against the heavier ones of two filters at the beginning: it is safe to begin light.
 _PRIOR = 0.1
+#: Least difference of the residuals that tells [counts].
+_TELLING = 0.3
 #: Share of the evidence that is left after a sample that tells.
 _MEMORY = 0.995
 #: Normalised square of a residual from which on it counts less: the model is wrong, not the noise.
 _OUTLIER = 25.0
+#: Time without torque after which another hand may be at the handle [s].
+_FORGOTTEN_S = 0.2
+#: Evidence against a filter, beyond that against the best one, up to which it may be right: three
+#: standard deviations.
+_BELIEVABLE = 9.0
+#: Ratio of the mass in force to the lightest believable one from which on a push is bounded.
+_CERTAIN = 1.3
+#: Share of the speed of approach with which a hand of uncertain mass may be returned.
+_RETURNED = 0.9
 #: Share of the way to the likeliest mass that is gone in a period.
 _FOLLOWED = 0.6
+#: Power of the mass with which the walk of a hand's force falls. What the steps of the encoder make
+#: felt at the handle grows with mass and bandwidth; so it stays below what is felt for all.
+_STEADINESS = 0.8
 #: Time constant at which a light hand's damping equals its inertia [s].
 _HAND_S = 1.5e-3
 
@@ -97,7 +120,7 @@ def set_bank(
         spring: Spring of all.
         period: T [s].
         count: One count of the encoder [rad].
-        force_walk: See `kalman_model`.
+        force_walk: See `kalman_model`; that of the lightest.
         delay: D in periods; its fraction counts.
     """
     n = len(masses)
@@ -108,9 +131,11 @@ def set_bank(
     bank["log_lightest"] = math.log(masses[0])
     bank["log_step"] = math.log(masses[-1] / masses[0]) / (n - 1)
     bank["spring"], bank["resolution"] = spring, abs(count)
+    bank["forgotten"] = round(_FORGOTTEN_S / period)
     bank["viscous"][0, :n] = viscous
     for i in range(n):
-        model = kalman_model(masses[i], viscous[i], spring, period, count, force_walk)
+        walk = force_walk * float(masses[0] / masses[i]) ** _STEADINESS
+        model = kalman_model(masses[i], viscous[i], spring, period, count, walk)
         _set_filter(bank[0], i, model, abs(count))
         phi, _ = zoh(masses[i], viscous[i], spring, period)
         _, before = zoh(masses[i], viscous[i], spring, fraction * period)
@@ -134,8 +159,10 @@ def reset_bank(bank: NDArray[np.void], y: float) -> None:
     bank["residual"] = 0.0
     bank["cost"] = _PRIOR * np.arange(MAX_FILTERS)
     bank["place"] = 0.0
-    bank["quiet"] = 0
-    bank["mass"] = np.exp(bank["log_lightest"])
+    bank["samples"] = y
+    bank["at_rest"] = 0
+    bank["approach"] = 0.0
+    bank["mass"] = bank["least_mass"] = np.exp(bank["log_lightest"])
     bank["spread"] = 0.0
 
 
@@ -160,9 +187,17 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
         state[1, i] += gain[1, i] * residual[i]
         state[2, i] += gain[2, i] * residual[i]
     changed = False
-    if most - least > bank.resolution and _torque_acted(estimator):
-        _learn(bank)
-        changed = _follow(bank)
+    moved = _moved(bank, y_sample)
+    if _torque_acted(estimator):
+        bank.at_rest = 0
+        if moved and most - least > _TELLING * bank.resolution:
+            _learn(bank)
+            changed = _follow(bank)
+    else:
+        bank.at_rest += 1
+        bank.approach = max(-estimator.v, 0.0)
+        if bank.at_rest == bank.forgotten:
+            changed = _forget(bank)
     k = min(int(bank.place), n - 2)
     share = bank.place - k
     estimator.y = state[0, k] + share * (state[0, k + 1] - state[0, k])
@@ -173,6 +208,36 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
         set_model(estimator, bank.mass, viscous, bank.spring)
         _set_covariance(bank, estimator, int(bank.place + 0.5))
     return changed
+
+
+@compiled
+def _moved(bank: Record, y_sample: float) -> bool:
+    """Return True if the handle has moved: at rest friction holds it, as if it were heavy."""
+    moved = abs(y_sample - bank.samples[_RECENT - 1]) > _MOVED * bank.resolution
+    for age in range(_RECENT - 1, 0, -1):
+        bank.samples[age] = bank.samples[age - 1]
+    bank.samples[0] = y_sample
+    return moved
+
+
+@compiled
+def _forget(bank: Record) -> bool:
+    """Begin with the lightest hand again; return True if another one was in force."""
+    for i in range(bank.count):
+        bank.cost[i] = _PRIOR * i
+    changed = bank.place != 0.0
+    bank.place, bank.spread = 0.0, 0.0
+    bank.mass = bank.least_mass = math.exp(bank.log_lightest)
+    return changed
+
+
+@compiled
+def bounded_push(bank: Record, wall: Record, force: float) -> float:
+    """Return a force that throws back no hand that may be at the handle faster than it came in."""
+    if bank.mass <= _CERTAIN * bank.least_mass:
+        return force
+    outwards = _RETURNED * bank.approach - wall.v
+    return min(force, max(0.0, outwards * bank.least_mass / wall.period - wall.d))
 
 
 @compiled
@@ -213,6 +278,10 @@ def _follow(bank: Record) -> bool:
     step = _FOLLOWED * (likeliest - bank.place)
     bank.place += step
     bank.mass = math.exp(bank.log_lightest + bank.log_step * bank.place)
+    believable = 0
+    while believable < best and cost[believable] > cost[best] + _BELIEVABLE:
+        believable += 1
+    bank.least_mass = math.exp(bank.log_lightest + bank.log_step * min(believable, bank.place))
     return step != 0.0
 
 

@@ -226,7 +226,7 @@ def clear_memory(wall: NDArray[np.void]) -> None:
 
 #: Growth in a period of a stiffness that the mass in force allows again: inside the wall, where
 #: the spring is loaded, and outside.
-_GROWTH_INSIDE, _GROWTH_OUTSIDE = 1.01, 1.2
+_GROWTH_INSIDE, _GROWTH_OUTSIDE = 1.03, 1.2
 
 
 @compiled

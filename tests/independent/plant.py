@@ -243,7 +243,7 @@ _RPDO = PdoLayout(0, (Field(0x6071, 0, 0, 16),))
 class Bench:
     """One configuration on one servo, to be struck by any operator at any stiffness."""
 
-    def __init__(self, keys: dict[str, Any], servo: Servo, seconds: float = 0.8) -> None:
+    def __init__(self, keys: dict[str, Any], servo: Servo, seconds: float = 1.2) -> None:
         self.settings = prepare(keys)
         self.servo = servo
         self.period = self.settings.bus.cycle_s
@@ -374,7 +374,7 @@ def k_limit(
     """
     mass = bench.servo.mass + operator.mass
     passed = 0.0
-    for normalised in np.geomspace(0.003, 2.5, 31) if scan is None else scan:
+    for normalised in np.geomspace(0.01, 2.5, 26) if scan is None else scan:
         stiffness = float(normalised) * mass / bench.period**2
         damping = damping_normalised * mass / bench.period
         referent = damping or 2.0 * damping_ratio * math.sqrt(stiffness * mass)
@@ -384,8 +384,3 @@ def k_limit(
                 return passed, float(normalised)
         passed = float(normalised)
     return passed, math.inf
-
-
-def with_friction(servo: Servo, coulomb: float) -> Servo:
-    """Return the servo with another Coulomb friction."""
-    return servo._replace(coulomb=coulomb)

@@ -1,0 +1,131 @@
+"""The bank of filters that identifies the operator."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from rig import settings_with
+from scipy.signal import cont2discrete
+
+from canwall.cycle.state import modelled_delay
+from canwall.walls import (
+    BANK,
+    ESTIMATOR,
+    correct,
+    correct_bank,
+    hand_damping,
+    note_missing_sample,
+    predict,
+    predict_bank,
+    reset_bank,
+    reset_estimator,
+    set_bank,
+    set_estimator,
+)
+
+PERIOD, COUNT, WALK, DELAY = 1e-3, 4.8e-5, 0.02, 1.35
+MASSES = np.geomspace(1e-4, 4.5e-3, 16)
+VISCOUS = 5e-4 + np.array([hand_damping(m - 1e-4, 0.04) for m in MASSES.tolist()])
+
+
+def bank_at(y: float) -> tuple[NDArray[np.void], NDArray[np.void]]:
+    bank, estimator = np.zeros(1, BANK), np.zeros(1, ESTIMATOR)
+    set_bank(bank, MASSES, VISCOUS, 0.0, PERIOD, COUNT, WALK, DELAY)
+    set_estimator(estimator, MASSES[0], VISCOUS[0], 0.0, 0.0, PERIOD, COUNT, WALK, DELAY)
+    reset_estimator(estimator, y)
+    reset_bank(bank, y)
+    return bank, estimator
+
+
+def discrete(mass: float, viscous: float, duration: float) -> tuple[Any, Any]:
+    a = np.array([[0.0, 1.0], [0.0, -viscous / mass]])
+    b = np.array([[0.0], [1.0 / mass]])
+    phi, gamma, *_ = cont2discrete((a, b, np.eye(2), np.zeros((2, 1))), duration)
+    return phi, gamma[:, 0]
+
+
+def play(
+    bank: NDArray[np.void] | None,
+    estimator: NDArray[np.void],
+    mass: float,
+    torques: NDArray[np.float64],
+    lost: tuple[int, ...] = (),
+    stuck: bool = False,
+) -> NDArray[np.float64]:
+    """Return the mass in force in each period of a handle of this mass under these torques."""
+    viscous = 5e-4 + hand_damping(mass - 1e-4, 0.04)
+    (phi1, gamma1), (phi2, gamma2) = (discrete(mass, viscous, s * PERIOD) for s in (0.35, 0.65))
+    x = np.array([0.0, -0.5 if not stuck else 0.0])
+    before = older = 0.0
+    found = np.empty(len(torques))
+    for j, torque in enumerate(torques.tolist()):
+        sample = COUNT * np.rint(x[0] / COUNT)
+        if j in lost:
+            note_missing_sample(estimator[0])
+        else:
+            correct(estimator[0], sample)
+            if bank is not None:
+                correct_bank(bank[0], estimator[0], sample)
+        found[j] = estimator["mass"][0]
+        if bank is not None:
+            predict_bank(bank[0], estimator[0], torque)
+        predict(estimator[0], torque)
+        # D = 1.35: the torque before the last one acts for 0.35 T, the last one for the rest.
+        if not stuck:
+            x = phi2 @ (phi1 @ x + gamma1 * older) + gamma2 * before
+        older, before = before, torque
+    return found
+
+
+def pulses(size: float) -> NDArray[np.float64]:
+    torques = np.zeros(120)
+    torques[60:90] = size * np.repeat([1.0, -0.4, 0.7], 10)
+    return torques
+
+
+@pytest.mark.parametrize("mass", [1.3e-4, 4.2e-4, 1.4e-3, 3.6e-3])
+def test_mass_is_found_within_samples_of_the_first_torque(mass: float) -> None:
+    found = play(*bank_at(0.0), mass, pulses(300.0 * mass))
+    # The lightest until a torque has acted, which takes two periods and a sample.
+    np.testing.assert_allclose(found[:62], MASSES[0], rtol=1e-12)
+    np.testing.assert_allclose(found[72:], mass, rtol=0.15)
+
+
+def test_state_is_that_of_the_matching_filter_alone() -> None:
+    bank, estimator = bank_at(0.0)
+    play(bank, estimator, float(MASSES[8]), pulses(0.3))
+    alone = np.zeros(1, ESTIMATOR)
+    walk = WALK * (MASSES[0] / MASSES[8]) ** 0.8
+    set_estimator(alone, MASSES[8], VISCOUS[8], 0.0, 0.0, PERIOD, COUNT, walk, DELAY)
+    reset_estimator(alone, 0.0)
+    play(None, alone, float(MASSES[8]), pulses(0.3))
+    np.testing.assert_allclose(bank["state"][0, :, 8], [alone[n][0] for n in "yvd"], rtol=1e-9)
+    np.testing.assert_allclose(bank["gain"][0, :, 8], alone["steady_gain"][0], rtol=1e-12)
+
+
+def test_nothing_is_learned_in_free_motion_nor_at_rest() -> None:
+    free = play(*bank_at(0.0), 3.6e-3, np.zeros(200))
+    held = play(*bank_at(0.0), 3.6e-3, np.full(200, 0.01), stuck=True)
+    assert np.all(free == free[0])
+    assert np.all(held == held[0])
+
+
+def test_hand_is_forgotten_after_the_contact() -> None:
+    torques = np.concatenate([pulses(0.3), np.zeros(210)])
+    found = play(*bank_at(0.0), 1.4e-3, torques)
+    assert found[100] > 1e-3
+    np.testing.assert_allclose(found[-1], MASSES[0], rtol=1e-12)
+
+
+def test_lost_samples_do_not_change_the_mass() -> None:
+    found = play(*bank_at(0.0), 1.4e-3, pulses(0.3), lost=(75, 76, 77))
+    assert np.all(found[75:78] == found[74])
+    np.testing.assert_allclose(found[88:], 1.4e-3, rtol=0.15)
+
+
+def test_drive_cycle_and_lag_belong_to_the_delay() -> None:
+    keys = {"drive.drive_cycle_s": 0.00025, "drive.current_bandwidth_hz": 1600.0}
+    assert modelled_delay(settings_with({})) == 1.0
+    expected = 1.0 + 0.25 + 1000.0 / (2.0 * np.pi * 1600.0)
+    np.testing.assert_allclose(modelled_delay(settings_with(keys)), expected)
