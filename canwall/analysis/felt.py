@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
 from canwall.compiled import compiled
 from canwall.physics import HandBody
@@ -53,6 +52,8 @@ def felt_band(period: float) -> FeltBand:
     Args:
         period: Sampling period T [s].
     """
+    from scipy import signal  # slow to import: not for a run without a judgement
+
     low, high = FELT_BAND_HZ
     rate = 1.0 / period
     if low >= 0.5 * rate:

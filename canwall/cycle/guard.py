@@ -20,14 +20,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from canwall.analysis.felt import FELT_BAND_HZ
 from canwall.compiled import Record, compiled
 
 #: Values of `[guard] action`.
 GUARD_ACTIONS = {"off": 0, "warn": 1, "act": 2}
 _OFF, _ACT = GUARD_ACTIONS["off"], GUARD_ACTIONS["act"]
 
-#: Band of the felt ripple [Hz].
-BAND_HZ = (20.0, 500.0)
 #: Ripple below this is left alone: 0.6 N at a handle of 80 mm [N·m].
 RIPPLE_NM = 0.05
 #: Length of a block [s].
@@ -115,7 +114,7 @@ def band_pass(period: float) -> NDArray[np.float64]:
     """Return two second-order sections for the band, or what of it a sampled force can have."""
     from scipy.signal import butter  # slow to import: not for a run without a guard
 
-    low, high = BAND_HZ
+    low, high = FELT_BAND_HZ
     rate = 1.0 / period
     if high < 0.45 * rate:
         return np.asarray(butter(2, (low, high), "bandpass", fs=rate, output="sos"))
