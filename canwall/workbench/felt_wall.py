@@ -132,7 +132,7 @@ def draw_impedance() -> Iterator[FigurePage]:
 
 
 def plain_wall_motion(beta: float, sigma: float) -> float:
-    """Return the counts peak to peak that a plain wall moves by, pressed and long after a strike."""
+    """Return the motion of a plain wall that is pressed long after a strike [counts]."""
     settings = _bare_drive(0.0, 0.0)
     count, period = simulated_units(settings).rad_per_count, settings.bus.cycle_s
     viscous, coulomb = beta * _PLANE_STIFFNESS * period, sigma * _PLANE_STIFFNESS * count
