@@ -129,23 +129,8 @@ class DiolaitiRegion(StrEnum):
     UNSTABLE = "unstable"
 
 
-def diolaiti_plane(
-    stiffness: Array, viscous: Array, coulomb: Array, count: float, period: float
-) -> tuple[Array, Array]:
-    """Return β = b/(K·T) and σ = f_c/(K·Δ) of plain walls.
-
-    Args:
-        stiffness: Stiffness K [N·m/rad], shape (n,), like the following.
-        viscous: Damping b of everything that moves [N·m·s/rad].
-        coulomb: Coulomb friction f_c [N·m].
-        count: One encoder count Δ [rad].
-        period: Sampling period T [s].
-    """
-    return viscous / (stiffness * period), coulomb / (stiffness * count)
-
-
 def diolaiti_region(beta: float, sigma: float, delay: float) -> DiolaitiRegion:
-    """Return the region of a plain wall with a delay of D periods.
+    """Return the region of a plain wall: β = b/(K·T), σ = f_c/(K·Δ), delay of D periods.
 
     Damping of β > 1/2 + D takes what sampling and delay give off at any amplitude; friction of
     σ > 1/2 takes what a quantised position gives off, and holds any motion that is small enough.

@@ -28,7 +28,7 @@ from canwall.workbench.traces import BALL, POINTS, drop_ball
 
 Array = NDArray[np.float64]
 
-EXTENT = Extent(long_s=120.0, drops=4, phases=6, thetas=4)
+EXTENT = Extent(long_s=120.0, drops=4, phases=6, thetas=4, plane=3)
 NAMES = [
     *(f"figure_5_{n:02}" for n in (3, 4, 8, 9, 10, 11, 12, 14, 16, 17, 18, 19)),
     "all_laws",
