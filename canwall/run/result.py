@@ -113,7 +113,7 @@ def _remarks_on_lag(axis: WallAxis) -> list[str]:
 
 def _guard_summary(axis: WallAxis) -> dict[str, Any]:
     """Return the alarms of the guard, the time of the first, and the least force that it left."""
-    guard, period = axis.cycle["guard"][0], axis.settings.bus.cycle_s
+    guard, period = axis.cycle["guard"][0, 0], axis.settings.bus.cycle_s
     first = int(guard["first_alarm"])
     return {
         "action": axis.settings.guard.action,
