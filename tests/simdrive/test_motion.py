@@ -245,6 +245,7 @@ def test_a_torque_step_arrives_as_the_lag_lets_it(bandwidth: float) -> None:
         cogging_nm=0.0,
         torque_step_nm=0.0,
         current_bandwidth_hz=bandwidth,
+        drive_cycle_s=0.0,
         hand=hand,
     )
     motion = ServoMotion(simulation, PERIOD, COUNTS_PER_REV)
