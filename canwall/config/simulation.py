@@ -37,11 +37,11 @@ class Simulation(Section):
 
     Friction is `coulomb_nm` in motion; at rest it holds up to `stiction_nm`, at least as much and
     by default 1.5 times that. The motor's cogging torque is a triangle wave of amplitude
-    `cogging_nm`, with `cogs_per_rev` periods per revolution. The current loop is a first-order lag of
-    `current_bandwidth_hz` (0: no lag) with a resolution of `torque_step_nm` (0: exact). The motor
-    delivers 1 + `torque_constant_error` of the torque that the drive believes and shows (0x6077).
-    The velocity (0x606C) is the difference of the encoder over one period, low-pass filtered with
-    `velocity_filter_hz` (0: unfiltered).
+    `cogging_nm`, with `cogs_per_rev` periods per revolution. The current loop is a first-order lag
+    of `current_bandwidth_hz` (0: no lag) with a resolution of `torque_step_nm` (0: exact). The
+    motor delivers 1 + `torque_constant_error` of the torque that the drive believes and shows
+    (0x6077). The velocity (0x606C) is the difference of the encoder over one period, low-pass
+    filtered with `velocity_filter_hz` (0: unfiltered).
 
     The drive has a control cycle of its own, `drive_cycle_s` (0: none), whose clock is fast by
     `clock_ppm` against the SYNC. At its ticks it latches position and torque for the next TPDO,
