@@ -122,8 +122,8 @@ def test_signals_are_what_the_frames_say(four_strikes: Record) -> None:
     ):
         assert four_strikes.column(column).tolist() == values, column
     nm_per_mille = four_strikes.summary["drive"]["nm_per_mille"]
-    applied = [torque * nm_per_mille for _, _, torque in tpdos]
-    assert four_strikes.column("torque_applied").tolist() == applied
+    actual = [torque * nm_per_mille for _, _, torque in tpdos]
+    assert four_strikes.column("torque_actual").tolist() == actual
 
 
 def test_torque_recomputed_from_the_frames_alone(four_strikes: Record) -> None:
