@@ -1,8 +1,8 @@
 """The main job in processes of its own: what a run leaves, and who may share machine and bus."""
 
 import itertools
-import signal
 import math
+import signal
 import struct
 import subprocess
 import sys
