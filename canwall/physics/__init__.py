@@ -7,21 +7,26 @@ drives or CAN.
 from canwall.physics.contact import Grasp, HandBody, advance_grasp
 from canwall.physics.motion import MAX_EVENTS, PLANT, advance, contact_end, make_plant, time_to_wall
 from canwall.physics.oscillator import acceleration, basis, flow, zoh, zoh_coefficients
+from canwall.physics.shaft import SHAFT, TwoMasses, advance_shaft, make_shaft
 from canwall.physics.smooth import Force
 
 __all__ = [
     "MAX_EVENTS",
     "PLANT",
+    "SHAFT",
     "Force",
     "Grasp",
     "HandBody",
+    "TwoMasses",
     "acceleration",
     "advance",
     "advance_grasp",
+    "advance_shaft",
     "basis",
     "contact_end",
     "flow",
     "make_plant",
+    "make_shaft",
     "time_to_wall",
     "zoh",
     "zoh_coefficients",

@@ -131,7 +131,11 @@ def test_loop_measures_the_delay_that_the_drive_was_given(
     asynchronous = given < 1.0
     extra = given if asynchronous else given - 1.0
     settings = settings_with(
-        {"estimator.measure_delay": True, "simulation.torque_delay_cycles": extra}
+        {
+            "estimator.measure_delay": True,
+            "simulation.ideal": True,
+            "simulation.torque_delay_cycles": extra,
+        }
     )
     assert settings.simulation is not None
     at_rest = settings.simulation.hand.model_copy(update={"first_strike_s": 1.0})

@@ -84,7 +84,11 @@ def test_change_in_a_contact_is_bumpless_on_the_bus(
     make_rig: RigFactory, update: dict[str, object]
 ) -> None:
     # A soft, damped wall, so that the contact is at rest when it changes.
-    calm = {"wall.law": "mean_force", "wall.stiffness_nm_per_rad": 30.0}
+    calm = {
+        "wall.law": "mean_force",
+        "wall.stiffness_nm_per_rad": 30.0,
+        "simulation.ideal": True,
+    }
     rig = make_rig(settings_with(calm))
     loop = Loop(rig)
     wall = rig.settings.wall.model_copy(update=update)

@@ -60,8 +60,8 @@ def test_a_spring_drawn_at_constant_speed_slips_as_scipy_has_it() -> None:
             pull = spring * (speed * s - state[0]) - viscous * state[1] - COULOMB
             return [state[1], pull / mass]
 
-        def stops(s: float, state: Any) -> float:
-            return state[1] if s > t + 1e-6 else 1.0
+        def stops(s: float, state: Any, t: float = t) -> float:
+            return float(state[1]) if s > t + 1e-6 else 1.0
 
         stops.terminal = True  # type: ignore[attr-defined]
         slip = solve_ivp(

@@ -91,6 +91,7 @@ VARIANTS: list[dict[str, Any]] = [
         "simulation.torque_delay_cycles": 0.4,
     },
     {"simulation.drive_cycle_s": 0.0015, "simulation.clock_ppm": -300.0},
+    {"simulation.shaft_hz": 300.0, "simulation.drive_cycle_s": 0.00025},
 ]
 
 

@@ -168,7 +168,7 @@ def test_tpdos_that_are_in_time_again(end: float) -> None:
 
 
 def test_tpdo_that_is_late_once_does_not_disturb_the_estimate() -> None:
-    settings, cycles = wall(1e-3, 50.0)
+    settings, cycles = wall(1e-3, 50.0, **{"simulation.ideal": True})  # type: ignore[arg-type]
     begin = 262  # as the handle hits the wall
     run = simulate(settings, cycles, disturbances=late_from(cycles, begin, begin + 2))
     assert (run.trip, run.lag) == (Trip.NONE, 0)

@@ -93,7 +93,7 @@ def test_latch_before_and_apply_after_make_one_drive_cycle_at_any_phase() -> Non
     """The delay from position to torque, found from the motion alone."""
     cycle = 0.25e-3
     for phase in np.linspace(0.05, 1.0, 8):
-        motion = servo(drive_cycle_s=cycle, clock_phase=float(phase))
+        motion = servo(drive_cycle_s=cycle, clock_ppm=0.0, clock_phase=float(phase))
         motion.advance(0.1, PERIOD)  # acts from phase·cycle on
         acts = motion.speed_rad_s * 1e-4 / 0.1
         latched = math.sqrt(2.0 * motion.counts() * 1e-9 * 1e-4 / 0.1)

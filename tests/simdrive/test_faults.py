@@ -50,7 +50,7 @@ class BusBench(Bench):
         simulation = Simulation(
             hand=Hand(strikes=0),
             coulomb_nm=0.0,
-            cogging_nm=0.0,
+            ideal=True,
             seed=seed,
             real_time=real_time,
             fault=tuple(FaultSettings(**fault) for fault in faults),

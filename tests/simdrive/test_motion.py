@@ -55,21 +55,35 @@ def least_jerk(hand: Hand, t: float) -> float:
 
 
 def test_what_moves_is_drive_and_hand_together() -> None:
-    simulation = SMOOTH.model_copy(update={"coulomb_nm": 0.01, "cogging_nm": 0.003})
+    simulation = SMOOTH.model_copy(
+        update={"coulomb_nm": 0.01, "stiction_nm": 0.02, "cogging_nm": 0.003}
+    )
+    friction = {"coulomb": 0.01, "stiction": 0.02}
     cogs = {"cogging": 0.003, "cog_pitch": math.pi / 12.0}
     assert hand_plant(simulation) == pytest.approx(
-        {
-            "mass": 1.64e-4,
-            "viscous": 0.0261,
-            "spring": 3.2,
-            "coulomb": 0.01,
-            "stiction": 0.01,
-            **cogs,
-        }
+        {"mass": 1.64e-4, "viscous": 0.0261, "spring": 3.2, **friction, **cogs}
     )
     assert handle_plant(simulation) == pytest.approx(
-        {"mass": 1e-4, "viscous": 5e-4, "coulomb": 0.01, **cogs}
+        {"mass": 1e-4, "viscous": 5e-4, **friction, **cogs}
     )
+
+
+def test_a_handle_on_a_shaft_resonates_at_its_frequency() -> None:
+    """Zero crossings of the encoder about the centre of mass, after a jerk of the motor."""
+    nobody = Hand(strikes=0, inertia_kg_m2=0.0, damping_nm_s_per_rad=0.0, stiffness_nm_per_rad=0.0)
+    changes = {"shaft_hz": 250.0, "shaft_damping_ratio": 0.0, "viscous_nm_s_per_rad": 0.0}
+    simulation = SMOOTH.model_copy(update={"hand": nobody, **changes})
+    motion, step = ServoMotion(simulation, PERIOD, COUNTS_PER_REV), 1e-5
+    motion.advance(0.5, 1e-3)
+    begin, speed = motion.position_rad, 0.5e-3 / 1e-4
+    off = []
+    for j in range(10_000):
+        off.append(motion.position_rad - begin - speed * j * step)
+        motion.advance(0.0, step)
+    swing = np.array(off) - np.mean(off)
+    crossings = np.flatnonzero((swing[:-1] < 0.0) & (swing[1:] >= 0.0))
+    period = (crossings[-1] - crossings[0]) * step / (len(crossings) - 1)
+    assert 1.0 / period == pytest.approx(250.0, rel=1e-3)
 
 
 def test_motion_is_that_of_the_differential_equation() -> None:
@@ -231,6 +245,7 @@ def test_a_torque_step_arrives_as_the_lag_lets_it(bandwidth: float) -> None:
         cogging_nm=0.0,
         torque_step_nm=0.0,
         current_bandwidth_hz=bandwidth,
+        drive_cycle_s=0.0,
         hand=hand,
     )
     motion = ServoMotion(simulation, PERIOD, COUNTS_PER_REV)

@@ -248,7 +248,7 @@ def test_configured_cycle_has_nothing_else_on_the_bus(cyclic: Bench) -> None:
 def test_actual_torque_is_what_the_current_loop_delivers() -> None:
     """0x6074 shows the demand at once, 0x6077 what of it has come by each SYNC."""
     bandwidth = 40.0
-    simulation = Simulation(current_bandwidth_hz=bandwidth, torque_step_nm=0.0)
+    simulation = Simulation(current_bandwidth_hz=bandwidth, torque_step_nm=0.0, drive_cycle_s=0.0)
     motion = ServoMotion(simulation, PERIOD_S, 131072.0)
     actuator = Actuator(motion, PERIOD_S, 0.0)
     assert not actuator.direct

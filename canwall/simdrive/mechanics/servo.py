@@ -10,16 +10,31 @@ from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
 from canwall.config import Simulation
-from canwall.physics import PLANT, Force, Grasp, HandBody, advance, advance_grasp, make_plant
+from canwall.physics import (
+    PLANT,
+    SHAFT,
+    Force,
+    Grasp,
+    HandBody,
+    TwoMasses,
+    advance,
+    advance_grasp,
+    advance_shaft,
+    make_plant,
+    make_shaft,
+)
 
-#: Plants (the handle alone, and joined with the hand), the hand as a separate body, current loop,
-#: control cycle and clock of the drive, and the state: position and velocity of handle and hand,
-#: torque in force in the drive, torque that its current loop believes to deliver, time until its
-#: next tick; encoder and torque as latched at the last one. Times are by the clock of the SYNC. SI.
+#: Plants: the handle alone, joined with the hand, and joined with it at the end of a shaft.
+#: The hand as a separate body. Current loop, control cycle and clock of the drive. The state:
+#: position and velocity at the encoder and of the hand (of handle and hand, if it grips); torque in
+#: force in the drive, torque that its current loop believes to deliver, time until its next tick;
+#: encoder and torque as latched at the last one. Times are by the clock of the SYNC. SI units.
 SERVO = np.dtype(
     [
         ("handle", PLANT, (1,)),
         ("joined", PLANT, (1,)),
+        ("elastic", "?"),
+        ("shaft", SHAFT, (1,)),
         ("grip", "?"),
         ("hand_mass", "f8"),
         ("hand_viscous", "f8"),
@@ -67,6 +82,25 @@ def hand_plant(simulation: Simulation) -> dict[str, float]:
     }
 
 
+def elastic_shaft(simulation: Simulation) -> NDArray[np.void]:
+    """Return rotor, shaft, and handle with hand; shape (1,), dtype SHAFT.
+
+    Two masses on a spring resonate at √(k/μ), where μ is their reduced mass.
+    """
+    hand, rotor = simulation.hand, simulation.rotor_inertia_kg_m2
+    handle = simulation.inertia_kg_m2 - rotor
+    reduced = rotor * handle / simulation.inertia_kg_m2
+    resonance = 2.0 * math.pi * simulation.shaft_hz
+    return make_shaft(
+        handle_plant(simulation) | {"mass": rotor},
+        handle + hand.inertia_kg_m2,
+        hand.damping_nm_s_per_rad,
+        hand.stiffness_nm_per_rad,
+        stiffness=resonance**2 * reduced,
+        damping=2.0 * simulation.shaft_damping_ratio * resonance * reduced,
+    )
+
+
 def hand_body(simulation: Simulation) -> HandBody:
     """Return the hand as a separate body, for a hand that can lose the handle."""
     hand = simulation.hand
@@ -80,6 +114,9 @@ def make_servo(simulation: Simulation, counts_per_rev: float) -> NDArray[np.void
     servo = np.zeros(1, SERVO)
     servo["handle"] = make_plant(**handle_plant(simulation))
     servo["joined"] = make_plant(**hand_plant(simulation))
+    servo["elastic"] = simulation.shaft_hz > 0.0
+    if simulation.shaft_hz > 0.0:
+        servo["shaft"] = elastic_shaft(simulation)
     servo["grip"] = simulation.hand.grip
     body = hand_body(simulation)
     servo["hand_mass"], servo["hand_viscous"] = body.mass, body.viscous
@@ -160,7 +197,12 @@ def _move_on(servos: NDArray[np.void], push: float, slope: float, duration: floa
     start = servo.torque if rate > 0.0 else servo.demand
     excess = start - servo.demand
     motor = Force(servo.torque_gain * start, 0.0, servo.torque_gain * excess, rate)
-    if servo.grip:
+    script = Force(push, slope, 0.0, 0.0)
+    if servo.elastic:
+        ends = TwoMasses(servo.y, servo.v, servo.hand_y, servo.hand_v)
+        ends = advance_shaft(servo.shaft[0], ends, motor, script, duration)
+        servo.y, servo.v, servo.hand_y, servo.hand_v = ends
+    elif servo.grip:
         joined = servo.joined[0]
         pull = motor.constant + push
         if excess == 0.0:
@@ -173,7 +215,6 @@ def _move_on(servos: NDArray[np.void], push: float, slope: float, duration: floa
     else:
         hand = HandBody(servo.hand_mass, servo.hand_viscous, servo.hand_spring, servo.hand_side)
         now = Grasp(servo.y, servo.v, servo.hand_y, servo.hand_v, servo.touching)
-        script = Force(push, slope, 0.0, 0.0)
         now = advance_grasp(servo.handle[0], servo.joined[0], hand, now, motor, script, duration)
         servo.y, servo.v, servo.hand_y, servo.hand_v, servo.touching = now
     servo.torque = servo.demand
