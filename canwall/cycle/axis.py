@@ -72,8 +72,7 @@ class WallAxis:
         self.frames = np.zeros(1, DRIVE_FRAMES)
         #: Times from a TPDO to its RPDO, and from the instant at which SYNC was due to the RPDO.
         self.latency, self.sync_to_rpdo = np.zeros(1, HISTOGRAM), np.zeros(1, HISTOGRAM)
-        given = self.settings.estimator.delay_cycles
-        self.delay = modelled_delay(self.settings) if given is None else given
+        self.delay = modelled_delay(self.settings)
         self.wall, self.limits = self.settings.wall, self.settings.limits
         self.turns = self.settings.laws_in_turn(self.settings.wall)
 

@@ -185,8 +185,7 @@ def make_cycle(settings: Settings, setup: DriveSetup, laws: Sequence[Law]) -> ND
     cycle["drive_torque_limit"] = setup.torque_limit_nm
     for i, law in enumerate(laws):
         cycle["laws"][0, i] = law.address
-    delay = settings.estimator.delay_cycles
-    set_delay(cycle, settings, modelled_delay(settings) if delay is None else delay)
+    set_delay(cycle, settings, modelled_delay(settings))
     set_limits(cycle, settings.limits)
     set_guard(cycle["guard"][0], settings.guard.action, period, setup.units.rad_per_count)
     mass, viscous, spring = _model(settings)
@@ -206,12 +205,16 @@ def _model(settings: Settings) -> tuple[float, float, float]:
 
 
 def modelled_delay(settings: Settings) -> float:
-    """Return D of a synchronous RPDO, with the drive's own cycle and current loop [periods]."""
-    drive = settings.drive
+    """Return D as configured, with the drive's own cycle and current loop added [periods].
+
+    A first-order lag counts as its time constant (theory, section 8).
+    """
+    drive, delay = settings.drive, settings.estimator.delay_cycles
     lag_s = 0.0
     if drive.current_bandwidth_hz:
         lag_s = 1.0 / (2.0 * math.pi * drive.current_bandwidth_hz)
-    return SYNCHRONOUS_DELAY + (drive.drive_cycle_s + lag_s) / settings.bus.cycle_s
+    bus = SYNCHRONOUS_DELAY if delay is None else delay
+    return bus + (drive.drive_cycle_s + lag_s) / settings.bus.cycle_s
 
 
 def _hands(settings: Settings) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
