@@ -267,6 +267,12 @@ class Settings(Section):
         others = [wall.model_copy(update={"law": law, "options": {}}) for law in wall.alternate]
         return [wall, *others]
 
+    def with_ideal_servo(self) -> Self:
+        """Return the same with an ideal simulated servo, of which the model of the laws knows."""
+        drive = self.drive.model_copy(update={"drive_cycle_s": 0.0, "current_bandwidth_hz": 0.0})
+        simulation = self.simulation and self.simulation.with_ideal_servo()
+        return self.model_copy(update={"drive": drive, "simulation": simulation})
+
     @property
     def force_walk(self) -> float:
         """Random walk of the operator's force in the model of the laws [N·m/√s]."""

@@ -99,6 +99,12 @@ class Simulation(Section):
         return by_index(self.objects)
 
     @property
+    def handle_inertia_kg_m2(self) -> float:
+        """Inertia of what the hand moves without the shaft: all, or the part beyond it."""
+        beyond = self.inertia_kg_m2 - self.rotor_inertia_kg_m2
+        return beyond if self.shaft_hz else self.inertia_kg_m2
+
+    @property
     def breakaway_nm(self) -> float:
         """Torque that sets the handle in motion from rest."""
         if self.stiction_nm is not None:

@@ -10,7 +10,16 @@ from canwall.cycle.machine import real_time_machine
 from canwall.cycle.python_can import PythonCanTransport
 from canwall.cycle.realtime import Grant, real_time_priority
 from canwall.cycle.sockets import SocketTransport
-from canwall.cycle.state import CYCLE, MAX_LAWS, fade_in, make_cycle, set_limits, set_wall, start_at
+from canwall.cycle.state import (
+    CYCLE,
+    MAX_LAWS,
+    fade_in,
+    make_cycle,
+    modelled_delay,
+    set_limits,
+    set_wall,
+    start_at,
+)
 from canwall.cycle.step import step
 from canwall.cycle.timing import HISTOGRAM, buckets_ns, observe_ns, percentile_ns, timing_summary
 from canwall.cycle.transport import CycleFrames, Transport
@@ -41,6 +50,7 @@ __all__ = [
     "buckets_ns",
     "fade_in",
     "make_cycle",
+    "modelled_delay",
     "named_law",
     "observe_ns",
     "percentile_ns",

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.config import Settings
+from canwall.cycle import modelled_delay
 from canwall.identify.fit import Estimate, UntellingDataError, torque_response
 
 Array = NDArray[np.float64]
@@ -52,8 +53,7 @@ def fit_hand(position: Array, torque: Array, period: float, settings: Settings) 
     j = np.arange(len(position))
     known = np.isfinite(position)
     y = np.interp(j, j[known], position[known])
-    given = settings.estimator.delay_cycles
-    driven = torque_response(torque, period, 1.0 if given is None else given, 0.0, 1.0, 1.0)[:, 0]
+    driven = torque_response(torque, period, modelled_delay(settings), 0.0, 1.0, 1.0)[:, 0]
     speed = np.gradient(y, period)
     friction = np.sign(speed)
 

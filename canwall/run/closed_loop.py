@@ -213,7 +213,7 @@ class ClosedLoop:
                 f"compensate for {MAX_DELAY} at most"
             )
         self._push, self._slope = hand_force(simulation.hand, settings.bus.cycle_s, cycles)
-        self._felt = felt_body(hand_body(simulation), simulation.inertia_kg_m2)
+        self._felt = felt_body(hand_body(simulation), simulation.handle_inertia_kg_m2)
         self._nm_per_mille = scales.rated_torque_mnm * _PER_MILLE_MILLI * scales.gear_ratio
         self._whole = math.floor(delay)
         self._share = delay - self._whole

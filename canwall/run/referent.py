@@ -64,7 +64,7 @@ class Referent:
         self._joined = make_plant(**simdrive.hand_plant(simulation))
         body = simdrive.hand_body(simulation)
         self._body = body._replace(side=self._side * body.side)
-        self._felt = felt_body(self._body, simulation.inertia_kg_m2)
+        self._felt = felt_body(self._body, simulation.handle_inertia_kg_m2)
 
     def motion(self, stiffness: Array, damping: Array, wall_position: Array) -> ReferentMotion:
         """Return the same as `referent_motion`."""

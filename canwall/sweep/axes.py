@@ -171,8 +171,7 @@ def settings_at(base: Settings, point: Point) -> Settings:
     settings = _with_keys(settings, {k: v for k, v in keys.items() if not _of_the_model(k)})
     assert settings.simulation is not None
     if values["servo"] == "ideal":
-        ideal = settings.simulation.with_ideal_servo()
-        settings = settings.model_copy(update={"simulation": ideal})
+        settings = settings.with_ideal_servo()
     model = law_model(settings, str(values["model"]), float(values["model_error"]))
     settings = settings.model_copy(update={"mechanics": model})
     settings = _with_keys(settings, {k: v for k, v in keys.items() if _of_the_model(k)})

@@ -50,10 +50,10 @@ _SHADES = {
 
 def _bare_drive(viscous: float, coulomb: float) -> Settings:
     """Return config/sim.toml with an ideal servo and nobody at the handle."""
-    settings = config.load(config.shipped("config/sim.toml"))
+    settings = config.load(config.shipped("config/sim.toml")).with_ideal_servo()
     assert settings.simulation is not None
     nobody = {key.rsplit(".")[-1]: value for key, value in OPERATORS["none"].keys.items()}
-    simulation = settings.simulation.with_ideal_servo().model_copy(
+    simulation = settings.simulation.model_copy(
         update={
             "viscous_nm_s_per_rad": viscous,
             "coulomb_nm": coulomb,
@@ -82,7 +82,7 @@ def measure_impedance(law: str) -> EffectiveImpedance:
     push[:ENABLING_CYCLES] = 0.0
     slope = np.diff(push, append=push[-1]) / settings.bus.cycle_s
     loop = ClosedLoop(settings, cycles).records()._replace(push=push, slope=slope)
-    signals = np.empty((3, cycles))
+    signals = np.empty((4, cycles))
     simulate_loop(loop, np.zeros(1, ROW), signals)
     push, y = push.reshape(_PERIODS, -1), signals[0].reshape(_PERIODS, -1)
     return impedance_at_lines(push[_FIRST:], y[_FIRST:], settings.bus.cycle_s, _LINES)
@@ -137,10 +137,10 @@ def plain_wall_motion(beta: float, sigma: float) -> float:
     count, period = simulated_units(settings).rad_per_count, settings.bus.cycle_s
     viscous, coulomb = beta * _PLANE_STIFFNESS * period, sigma * _PLANE_STIFFNESS * count
     settings = _on_wall(_bare_drive(viscous, coulomb), "standard", _PLANE_STIFFNESS, 0.0)
-    settings = strike_settings(settings, 0.5, 0.3, 0.01, 0.5)
+    settings = strike_settings(settings, 0.5, 0.3, 0.01, 0.5, 0.15)
     assert settings.run.duration_s is not None
     cycles = round(settings.run.duration_s / period)
-    signals = np.empty((3, cycles))
+    signals = np.empty((4, cycles))
     done = simulate_loop(ClosedLoop(settings, cycles).records(), np.zeros(1, ROW), signals)
     if done < cycles:
         return float("inf")  # a limit has ended it
