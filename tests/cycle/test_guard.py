@@ -140,7 +140,7 @@ def struck(operator: str, action: str, law: str, k: float, speed: float = 0.7) -
             "schedule": (),
         }
     )
-    return strike_settings(settings, speed, 0.3, 0.02, 0.5)
+    return strike_settings(settings, speed, 0.3, 0.02, 0.5, 0.15)
 
 
 def cycles_of(settings: Settings) -> int:
