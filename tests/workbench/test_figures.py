@@ -32,6 +32,8 @@ EXTENT = Extent(long_s=120.0, drops=4, phases=6, thetas=4, plane=3)
 NAMES = [
     *(f"figure_5_{n:02}" for n in (3, 4, 8, 9, 10, 11, 12, 14, 16, 17, 18, 19)),
     "all_laws",
+    "effective_impedance",
+    "diolaiti_plane",
 ]
 
 
