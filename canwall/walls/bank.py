@@ -1,9 +1,11 @@
-"""The operator identified in the cycle: a bank of steady-state Kalman filters over the mass.
+"""The operator identified in the cycle, and a bank of steady-state Kalman filters over the mass.
 
-Each filter believes in another hand at the handle. Under the wall's torques their residuals tell
-which one is right; in free motion all agree, and nothing is learned (theory, section 8). State and
-mass in force are interpolated between the two filters next to the likeliest mass. Coulomb friction
-is left to the bias force d̂: a bank that believes in friction which is not there fails.
+The mass follows from a regression: one fast observer, with a bias of its own, follows the positions
+without any torque, the torque alone, and the velocity alone. What it does not expect of the
+positions is −1/m times the same of the torque, plus b/m times that of the velocity; what changes
+slowly (the operator's push, friction in one direction) is in none of them. State and model in force
+are interpolated between the two filters next to that mass. Coulomb friction is left to the bias
+force d̂ (theory, section 8).
 
 The bank works on an estimator in its steady state and hands over state and model to it. In a gap
 of samples, and until the estimator has settled again, the estimator goes on alone and the bank
@@ -22,10 +24,8 @@ from canwall.walls.estimator import MAX_DELAY, KalmanModel, kalman_model, set_mo
 #: Largest number of filters.
 MAX_FILTERS = 24
 
-#: Number of samples over which the handle has to move for its motion to tell a mass.
-_RECENT = 4
-#: Its least motion over these samples [counts].
-_MOVED = 2.0
+#: Number of samples that are kept: two differences give the velocity to come.
+_RECENT = 3
 
 #: A bank, in the order of the masses. Gains, covariances and transitions are made beforehand:
 #: nothing of a Riccati equation is left for the cycle.
@@ -52,9 +52,17 @@ BANK = np.dtype(
         ("transition", "f8", (MAX_FILTERS, 3, 3)),
         ("scale", "f8", (MAX_FILTERS, 3)),
         ("force_noise", "f8", (MAX_FILTERS,)),
-        # Evidence against each filter; place of the mass in force on the scale of their numbers.
-        ("cost", "f8", (MAX_FILTERS,)),
-        ("residual", "f8", (MAX_FILTERS,)),
+        # The observer of [y, ẏ, ÿ], its gain, and its state for positions, torque (of a unit mass)
+        # and velocity; what it does not expect of them at this sample; the sums of their products.
+        ("observer_gain", "f8", (3,)),
+        ("observed", "f8", (3, 3)),
+        ("surprise", "f8", (3,)),
+        ("information", "f8", (3, 3)),
+        ("period", "f8"),
+        ("delay_share", "f8"),  # of a period, up to the instant of actuation
+        ("steady", "i8"),  # samples in a row that moved on in one direction
+        ("direction", "f8"),
+        # Place of the mass in force on the scale of the filters' numbers.
         ("place", "f8"),
         ("samples", "f8", (_RECENT,)),  # the last ones, newest first [rad]
         ("at_rest", "i8"),  # samples without torque in a row
@@ -67,19 +75,22 @@ BANK = np.dtype(
     align=True,
 )
 
-#: Evidence against the heavier ones of two filters at the beginning: it is safe to begin light.
-_PRIOR = 0.1
-#: Least difference of the residuals that tells [counts].
-_TELLING = 0.3
-#: Share of the evidence that is left after a sample that tells.
-_MEMORY = 0.995
-#: Normalised square of a residual from which on it counts less: the model is wrong, not the noise.
-_OUTLIER = 25.0
+#: Bandwidth of the observer, faster than what hand and friction do meanwhile [Hz].
+_OBSERVER_HZ = 50.0
+#: Uncertainty of a sample, with all that the model leaves out [counts].
+_UNCERTAINTY = 1.0
+#: Samples in one direction after which friction is part of the bias, and the least way of each
+#: [counts]: a handle that sticks is as heavy as the world.
+_STEADY, _LEAST_WAY = 6, 1.5
+#: Share of what is known that is left after a sample that tells as much as those before.
+_MEMORY = 0.98
+#: Before the first torque: standard deviation of m₀/m about 1, with m₀ the lightest mass; mean and
+#: standard deviation of b/m [1/s].
+_PRIOR_LIGHTNESS, _PRIOR_RATE, _PRIOR_RATE_DEVIATION = 0.7, 100.0, 150.0
 #: Time without torque after which another hand may be at the handle [s].
 _FORGOTTEN_S = 0.2
-#: Evidence against a filter, beyond that against the best one, up to which it may be right: three
-#: standard deviations.
-_BELIEVABLE = 9.0
+#: Standard deviations of 1/m up to which a lighter hand is believable.
+_BELIEVABLE = 2.0
 #: Ratio of the mass in force to the lightest believable one from which on a push is bounded.
 _CERTAIN = 1.3
 #: Share of the speed of approach with which a hand of uncertain mass may be returned.
@@ -132,6 +143,8 @@ def set_bank(
     bank["log_step"] = math.log(masses[-1] / masses[0]) / (n - 1)
     bank["spring"], bank["resolution"] = spring, abs(count)
     bank["forgotten"] = round(_FORGOTTEN_S / period)
+    bank["period"], bank["delay_share"] = period, fraction
+    bank["observer_gain"] = _observer_gain(period)
     bank["viscous"][0, :n] = viscous
     for i in range(n):
         walk = force_walk * float(masses[0] / masses[i]) ** _STEADINESS
@@ -145,6 +158,23 @@ def set_bank(
         bank["newer"][0, :, i] = after
 
 
+def _observer_gain(period: float) -> NDArray[np.float64]:
+    """Return the gain that gives the observer three equal poles: Ackermann's formula.
+
+    They are at its bandwidth, but no faster than a tenth of the sample rate.
+    """
+    pole = math.exp(-2.0 * math.pi * min(_OBSERVER_HZ * period, 0.1))
+    t = period
+    a2, a1, a0 = -3.0 * pole, 3.0 * pole**2, -(pole**3)
+    matrix = np.array([[1.0, t, 0.5 * t * t], [0.0, 1.0, t], [0.0, 0.0, 1.0]])
+    # For x⁺ = A·(x + L·(y − c·x)): the pair (A, c·A).
+    poly = np.linalg.matrix_power(matrix, 3) + a2 * matrix @ matrix + a1 * matrix + a0 * np.eye(3)
+    c = np.array([1.0, 0.0, 0.0]) @ matrix
+    seen = np.stack([c, c @ matrix, c @ matrix @ matrix])
+    gain: NDArray[np.float64] = poly @ np.linalg.solve(seen, np.array([0.0, 0.0, 1.0]))
+    return gain
+
+
 def _set_filter(bank: np.void, i: int, model: KalmanModel, count: float) -> None:
     bank["gain"][:, i] = model.gain
     bank["variance"][i] = (model.covariance[0, 0] + 1.0 / 12.0) * count * count
@@ -156,8 +186,9 @@ def reset_bank(bank: NDArray[np.void], y: float) -> None:
     """Begin at rest at y with the lightest hand."""
     bank["state"] = 0.0
     bank["state"][:, 0] = y
-    bank["residual"] = 0.0
-    bank["cost"] = _PRIOR * np.arange(MAX_FILTERS)
+    bank["observed"] = bank["information"] = 0.0
+    bank["observed"][:, 0, 0] = y
+    bank["steady"], bank["direction"] = 0, 0.0
     bank["place"] = 0.0
     bank["samples"] = y
     bank["at_rest"] = 0
@@ -177,20 +208,19 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
     if not estimator.settled:
         for i in range(n):
             state[0, i], state[1, i], state[2, i] = estimator.y, estimator.v, estimator.d
+        _begin_observing(bank, y_sample)
         return False
-    residual = bank.residual
-    least, most = math.inf, -math.inf
     for i in range(n):
-        residual[i] = y_sample - state[0, i]
-        least, most = min(least, residual[i]), max(most, residual[i])
-        state[0, i] += gain[0, i] * residual[i]
-        state[1, i] += gain[1, i] * residual[i]
-        state[2, i] += gain[2, i] * residual[i]
+        residual = y_sample - state[0, i]
+        state[0, i] += gain[0, i] * residual
+        state[1, i] += gain[1, i] * residual
+        state[2, i] += gain[2, i] * residual
     changed = False
-    moved = _moved(bank, y_sample)
+    _observe(bank, y_sample)
+    _note_direction(bank, y_sample)
     if _torque_acted(estimator):
         bank.at_rest = 0
-        if moved and most - least > _TELLING * bank.resolution:
+        if bank.steady >= _STEADY:
             _learn(bank)
             changed = _follow(bank)
     else:
@@ -211,20 +241,55 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
 
 
 @compiled
-def _moved(bank: Record, y_sample: float) -> bool:
-    """Return True if the handle has moved: at rest friction holds it, as if it were heavy."""
-    moved = abs(y_sample - bank.samples[_RECENT - 1]) > _MOVED * bank.resolution
+def _begin_observing(bank: Record, y_sample: float) -> None:
+    bank.observed[:] = 0.0
+    bank.observed[0, 0] = y_sample
+    for age in range(_RECENT):
+        bank.samples[age] = y_sample
+    bank.steady = 0
+
+
+@compiled
+def _observe(bank: Record, y_sample: float) -> None:
+    """Correct the observer: what it did not expect of the sample, of torque and of velocity."""
+    for c in range(3):
+        bank.surprise[c] = (y_sample if c == 0 else 0.0) - bank.observed[0, c]
+        for i in range(3):
+            bank.observed[i, c] += bank.observer_gain[i] * bank.surprise[c]
+
+
+@compiled
+def _note_direction(bank: Record, y_sample: float) -> None:
+    way = y_sample - bank.samples[0]
+    goes_on = abs(way) >= _LEAST_WAY * bank.resolution and way * bank.direction >= 0.0
+    bank.steady = bank.steady + 1 if goes_on else 0
+    bank.direction = way
     for age in range(_RECENT - 1, 0, -1):
         bank.samples[age] = bank.samples[age - 1]
     bank.samples[0] = y_sample
-    return moved
+
+
+@compiled
+def _predict_observer(bank: Record, older: float, newer: float) -> None:
+    """Advance the observer by a period under the torques before and after the actuation."""
+    t, share, x = bank.period, bank.delay_share, bank.observed
+    for c in range(3):
+        x[0, c] += t * x[1, c] + 0.5 * t * t * x[2, c]
+        x[1, c] += t * x[2, c]
+    rest = 1.0 - share
+    x[0, 1] += t * t * (share * (1.0 - 0.5 * share) * older + 0.5 * rest * rest * newer)
+    x[1, 1] += t * (share * older + rest * newer)
+    y = bank.samples
+    # In the middle of the coming period, extrapolated from the middles of the last two.
+    v = (2.0 * y[0] - 3.0 * y[1] + y[2]) / t
+    x[0, 2] += 0.5 * t * t * v
+    x[1, 2] += t * v
 
 
 @compiled
 def _forget(bank: Record) -> bool:
     """Begin with the lightest hand again; return True if another one was in force."""
-    for i in range(bank.count):
-        bank.cost[i] = _PRIOR * i
+    bank.information[:] = 0.0
     changed = bank.place != 0.0
     bank.place, bank.spread = 0.0, 0.0
     bank.mass = bank.least_mass = math.exp(bank.log_lightest)
@@ -250,39 +315,53 @@ def _torque_acted(estimator: Record) -> bool:
 
 @compiled
 def _learn(bank: Record) -> None:
-    """Add the evidence of the residuals, J ← 0.995·J + e with e = r²/S up to a bound."""
-    for i in range(bank.count):
-        e = bank.residual[i] * bank.residual[i] / bank.variance[i]
-        if e > _OUTLIER:
-            e = _OUTLIER - math.sqrt(_OUTLIER) + math.sqrt(e)
-        bank.cost[i] = _MEMORY * bank.cost[i] + e
+    """Add what this sample tells; in return as much of what was known is forgotten."""
+    r, information = bank.surprise, bank.information
+    tells = r[1] * r[1]
+    share = 1.0
+    if tells < (1.0 - _MEMORY) * information[1, 1]:
+        share = tells / ((1.0 - _MEMORY) * information[1, 1])
+    left = 1.0 - (1.0 - _MEMORY) * share
+    for i in range(3):
+        for c in range(3):
+            information[i, c] = left * information[i, c] + r[i] * r[c]
 
 
 @compiled
 def _follow(bank: Record) -> bool:
-    """Move the mass in force towards the likeliest one; return True if it moved."""
-    cost, n = bank.cost, bank.count
-    best = 0
-    for i in range(1, n):
-        if cost[i] < cost[best]:
-            best = i
-    k = min(max(best, 1), n - 2)
-    # The parabola through three costs, a·(x − x*)²; a deviation of one unit is a standard one.
-    a = 0.5 * (cost[k - 1] + cost[k + 1]) - cost[k]
-    likeliest = float(best)
-    if a > 0.0:
-        vertex = k - 0.25 * (cost[k + 1] - cost[k - 1]) / a
-        likeliest = min(max(vertex, best - 0.5), best + 0.5)
-    likeliest = min(max(likeliest, 0.0), n - 1.0)
-    bank.spread = bank.log_step * min(1.0 / math.sqrt(a), n - 1.0) if a > 0.0 else 0.0
-    step = _FOLLOWED * (likeliest - bank.place)
+    """Move the mass in force towards the likeliest one; return True if it moved.
+
+    The least squares of r₀ + r₁·(1/m) − r₂·(b/m), with what is known before the first torque.
+    """
+    lightest = math.exp(bank.log_lightest)
+    variance = (_UNCERTAINTY * bank.resolution) ** 2
+    s = bank.information
+    of_lightness = (lightest / _PRIOR_LIGHTNESS) ** 2
+    of_rate = 1.0 / _PRIOR_RATE_DEVIATION**2
+    p11, p12 = s[1, 1] / variance + of_lightness, -s[1, 2] / variance
+    p22 = s[2, 2] / variance + of_rate
+    q1 = -s[0, 1] / variance + of_lightness / lightest
+    q2 = s[0, 2] / variance + of_rate * _PRIOR_RATE
+    determinant = p11 * p22 - p12 * p12
+    lightness = (q1 * p22 - q2 * p12) / determinant
+    deviation = math.sqrt(p22 / determinant)
+    bank.spread = deviation / max(lightness, deviation)
+    step = _FOLLOWED * (_place_of(bank, lightness) - bank.place)
     bank.place += step
     bank.mass = math.exp(bank.log_lightest + bank.log_step * bank.place)
-    believable = 0
-    while believable < best and cost[believable] > cost[best] + _BELIEVABLE:
-        believable += 1
-    bank.least_mass = math.exp(bank.log_lightest + bank.log_step * min(believable, bank.place))
+    believable = _place_of(bank, lightness + _BELIEVABLE * deviation)
+    least = min(believable, bank.place)
+    bank.least_mass = math.exp(bank.log_lightest + bank.log_step * least)
     return step != 0.0
+
+
+@compiled
+def _place_of(bank: Record, lightness: float) -> float:
+    """Return the place of the mass 1/lightness among the filters."""
+    if lightness <= 0.0:
+        return bank.count - 1.0
+    place = (-math.log(lightness) - bank.log_lightest) / bank.log_step
+    return min(max(place, 0.0), bank.count - 1.0)
 
 
 @compiled
@@ -305,6 +384,7 @@ def predict_bank(bank: Record, estimator: Record, force: float) -> None:
     n = estimator.delay_periods
     older = estimator.in_flight[n]
     newer = force if n == 0 else estimator.in_flight[n - 1]
+    _predict_observer(bank, older, newer)
     state, phi = bank.state, bank.phi
     for i in range(bank.count):
         y, v, d = state[0, i], state[1, i], state[2, i]

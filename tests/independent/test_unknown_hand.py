@@ -52,6 +52,7 @@ def test_wall_is_stiff_and_quiet_in_every_hand(name: str) -> None:
     for strike in STRIKES[1::3]:
         s = bench.strike(hand, strike, stiffness, referent_damping=damping)
         assert judge(s)[0], strike
+        assert s.mass[-1] == pytest.approx(mass, rel=0.35), strike
         assert not judge(standard.strike(hand, strike, stiffness))[0]
 
 
