@@ -66,6 +66,23 @@ def felt_band(period: float) -> FeltBand:
 
 
 @compiled
+def filtered(sections: Array, state: Array, value: float) -> float:
+    """Pass a value through second-order sections (direct form II, transposed).
+
+    Args:
+        sections: Coefficients, shape (n, 6), as from `scipy.signal.butter`.
+        state: State, shape (n, 2); changed.
+        value: Input.
+    """
+    for k in range(len(sections)):
+        passed = sections[k, 0] * value + state[k, 0]
+        state[k, 0] = sections[k, 1] * value - sections[k, 4] * passed + state[k, 1]
+        state[k, 1] = sections[k, 2] * value - sections[k, 5] * passed
+        value = passed
+    return value
+
+
+@compiled
 def band_rms(band: FeltBand, force: Array, start: int, stop: int) -> float:
     """Return the r.m.s. of a force in the band over [start, stop), NaN if that is empty.
 
@@ -76,13 +93,7 @@ def band_rms(band: FeltBand, force: Array, start: int, stop: int) -> float:
     state = band.steady * force[0]
     power = 0.0
     for j in range(stop):
-        value = force[j]
-        for k in range(len(band.sections)):
-            b, a = band.sections[k, :3], band.sections[k, 3:]
-            filtered = b[0] * value + state[k, 0]
-            state[k, 0] = b[1] * value - a[1] * filtered + state[k, 1]
-            state[k, 1] = b[2] * value - a[2] * filtered
-            value = filtered
+        value = filtered(band.sections, state, force[j])
         if j >= start:
             power += value * value
     return np.sqrt(power / (stop - start))
@@ -101,7 +112,7 @@ def felt_body(hand: HandBody, inertia: float) -> HandBody:
 
 
 @compiled
-def mean_force(
+def mean_hand_force(
     body: HandBody, y: float, v: float, y_next: float, v_next: float, push: float, period: float
 ) -> float:
     """Return the mean force on a hand over one period, from its motion [N·m].

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from canwall.analysis.felt import mean_force
+from canwall.analysis.felt import mean_hand_force
 from canwall.compiled import Record, compiled
 from canwall.physics import Force, Grasp, HandBody, advance, advance_grasp
 
@@ -77,7 +77,7 @@ def _felt(
 ) -> float:
     """Return the mean force on the hand over period j."""
     push = inputs.pull[j] + 0.5 * inputs.slope[j] * inputs.period
-    return mean_force(inputs.felt, y, v, y_next, v_next, push, inputs.period)
+    return mean_hand_force(inputs.felt, y, v, y_next, v_next, push, inputs.period)
 
 
 @compiled

@@ -20,7 +20,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from canwall.analysis.felt import FELT_BAND_HZ
+from canwall.analysis.felt import FELT_BAND_HZ, filtered
 from canwall.compiled import Record, compiled
 
 #: Values of `[guard] action`.
@@ -161,21 +161,9 @@ def watch(
 
 
 @compiled
-def _filtered(guard: Record, value: float) -> float:
-    """Pass a value through the sections (direct form II, transposed)."""
-    for k in range(2):
-        section, state = guard.sections[k], guard.states[k]
-        passed = section[0] * value + state[0]
-        state[0] = section[1] * value - section[4] * passed + state[1]
-        state[1] = section[2] * value - section[5] * passed
-        value = passed
-    return value
-
-
-@compiled
 def _ripples(guard: Record, force: float) -> bool:
     """Return True at the end of a block with which the force has rippled for long enough."""
-    ripple = _filtered(guard, force)
+    ripple = filtered(guard.sections, guard.states, force)
     guard.peak = max(guard.peak, abs(ripple))
     guard.squares += ripple * ripple
     if ripple * guard.side <= 0.0 and abs(ripple) > 0.5 * RIPPLE_NM:

@@ -44,7 +44,7 @@ class Outcome:
     notes: list[str] = field(default_factory=list)
     """Steps of the way out that the drives refused, although they are disabled."""
     machine: dict[str, Grant] = field(default_factory=dict)
-    """What the machine has granted to the loop."""
+    """Grants of the machine to the loop."""
     error: BaseException | None = None
     """Failure of the program itself, which is raised once all else is done."""
 

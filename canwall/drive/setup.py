@@ -151,7 +151,7 @@ def _absent(node: DriveNode) -> list[str]:
 
 
 class _Prepared(NamedTuple):
-    """What `DriveSetup` says about mode, PDOs, SYNC and watchdog."""
+    """Part of a `DriveSetup`: mode, PDOs, SYNC and watchdog."""
 
     mode: Mode
     tpdo: PdoLayout

@@ -83,7 +83,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Residuals:
-    """What the model leaves of the measured positions.
+    """Rest of the measured positions, without what the model explains.
 
     Attributes:
         rms: Root of their mean square [encoder steps]; 0.29 is that of quantisation alone.

@@ -29,7 +29,7 @@ _FEWEST_RAMPS = 4
 
 @dataclass(frozen=True)
 class Measured:
-    """What the cycle noted, one value per SYNC.
+    """Notes of the cycle, one value per SYNC.
 
     Attributes:
         position: Positions [rad], NaN where a TPDO was missing.

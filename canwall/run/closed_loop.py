@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from canwall.analysis.felt import felt_body, mean_force
+from canwall.analysis.felt import felt_body, mean_hand_force
 from canwall.compiled import Record, compiled, copied
 from canwall.config import ConfigError, Settings
 from canwall.cycle import Trip, fade_in, make_cycle, run_laws, start_at, step
@@ -72,7 +72,7 @@ class SimulatedRun:
 
 @dataclass(frozen=True)
 class Disturbances:
-    """What bus and master do to TPDOs and SYNCs; each of shape (cycles,).
+    """Faults of bus and master in TPDOs and SYNCs; each of shape (cycles,).
 
     Attributes:
         lost: True for each SYNC whose TPDO is lost.
@@ -387,7 +387,7 @@ def _run_cycles(loop: LoopRecords, rows: NDArray[np.void], signals: Array) -> in
         torque = sent[whole] * nm_per_mille
         counts = move_servo(servos, torque, after, slope[j], length - before)
         mean_push = at_sync + 0.5 * slope[j] * length
-        signals[3, j] = mean_force(
+        signals[3, j] = mean_hand_force(
             loop.felt, hand_y, hand_v, servo.hand_y, servo.hand_v, mean_push, length
         )
         if skipped[j]:

@@ -47,7 +47,6 @@ BANK = np.dtype(
         ("older", "f8", (2, MAX_FILTERS)),
         ("newer", "f8", (2, MAX_FILTERS)),
         # Models for an estimator that loses samples.
-        ("variance", "f8", (MAX_FILTERS,)),  # of the innovation [rad²]
         ("covariance", "f8", (MAX_FILTERS, 3, 3)),
         ("transition", "f8", (MAX_FILTERS, 3, 3)),
         ("scale", "f8", (MAX_FILTERS, 3)),
@@ -149,7 +148,7 @@ def set_bank(
     for i in range(n):
         walk = force_walk * float(masses[0] / masses[i]) ** _STEADINESS
         model = kalman_model(masses[i], viscous[i], spring, period, count, walk)
-        _set_filter(bank[0], i, model, abs(count))
+        _set_filter(bank[0], i, model)
         phi, _ = zoh(masses[i], viscous[i], spring, period)
         _, before = zoh(masses[i], viscous[i], spring, fraction * period)
         phi_after, after = zoh(masses[i], viscous[i], spring, (1.0 - fraction) * period)
@@ -159,25 +158,18 @@ def set_bank(
 
 
 def _observer_gain(period: float) -> NDArray[np.float64]:
-    """Return the gain that gives the observer three equal poles: Ackermann's formula.
+    """Return the gain that gives the observer of [y, ẏ, ÿ] three equal poles p.
 
-    They are at its bandwidth, but no faster than a tenth of the sample rate.
+    They are at its bandwidth, but no faster than a tenth of the sample rate. It is the
+    fading-memory filter of third order: 1 − p³, 1.5·(1 − p)²·(1 + p)/T, (1 − p)³/T².
     """
     pole = math.exp(-2.0 * math.pi * min(_OBSERVER_HZ * period, 0.1))
-    t = period
-    a2, a1, a0 = -3.0 * pole, 3.0 * pole**2, -(pole**3)
-    matrix = np.array([[1.0, t, 0.5 * t * t], [0.0, 1.0, t], [0.0, 0.0, 1.0]])
-    # For x⁺ = A·(x + L·(y − c·x)): the pair (A, c·A).
-    poly = np.linalg.matrix_power(matrix, 3) + a2 * matrix @ matrix + a1 * matrix + a0 * np.eye(3)
-    c = np.array([1.0, 0.0, 0.0]) @ matrix
-    seen = np.stack([c, c @ matrix, c @ matrix @ matrix])
-    gain: NDArray[np.float64] = poly @ np.linalg.solve(seen, np.array([0.0, 0.0, 1.0]))
-    return gain
+    rest = 1.0 - pole
+    return np.array([1.0 - pole**3, 1.5 * rest**2 * (1.0 + pole) / period, rest**3 / period**2])
 
 
-def _set_filter(bank: np.void, i: int, model: KalmanModel, count: float) -> None:
+def _set_filter(bank: np.void, i: int, model: KalmanModel) -> None:
     bank["gain"][:, i] = model.gain
-    bank["variance"][i] = (model.covariance[0, 0] + 1.0 / 12.0) * count * count
     bank["covariance"][i], bank["transition"][i] = model.covariance, model.transition
     bank["scale"][i], bank["force_noise"][i] = model.scale, model.force_noise
 
@@ -292,7 +284,7 @@ def _forget(bank: Record) -> bool:
     bank.information[:] = 0.0
     changed = bank.place != 0.0
     bank.place, bank.spread = 0.0, 0.0
-    bank.mass = bank.least_mass = math.exp(bank.log_lightest)
+    bank.mass = bank.least_mass = _mass_at(bank, 0.0)
     return changed
 
 
@@ -333,7 +325,7 @@ def _follow(bank: Record) -> bool:
 
     The least squares of r₀ + r₁·(1/m) − r₂·(b/m), with what is known before the first torque.
     """
-    lightest = math.exp(bank.log_lightest)
+    lightest = _mass_at(bank, 0.0)
     variance = (_UNCERTAINTY * bank.resolution) ** 2
     s = bank.information
     of_lightness = (lightest / _PRIOR_LIGHTNESS) ** 2
@@ -348,11 +340,15 @@ def _follow(bank: Record) -> bool:
     bank.spread = deviation / max(lightness, deviation)
     step = _FOLLOWED * (_place_of(bank, lightness) - bank.place)
     bank.place += step
-    bank.mass = math.exp(bank.log_lightest + bank.log_step * bank.place)
+    bank.mass = _mass_at(bank, bank.place)
     believable = _place_of(bank, lightness + _BELIEVABLE * deviation)
-    least = min(believable, bank.place)
-    bank.least_mass = math.exp(bank.log_lightest + bank.log_step * least)
+    bank.least_mass = _mass_at(bank, min(believable, bank.place))
     return step != 0.0
+
+
+@compiled
+def _mass_at(bank: Record, place: float) -> float:
+    return math.exp(bank.log_lightest + bank.log_step * place)
 
 
 @compiled

@@ -1,4 +1,4 @@
-"""What a person feels of a wall, and where it is stable, as figures of their own."""
+"""Figures of the impedance that a person feels of a wall, and of where the wall is stable."""
 
 from collections.abc import Iterator
 

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import integrate, signal
 
-from canwall.analysis.felt import band_rms, felt_band, felt_body, mean_force
+from canwall.analysis.felt import band_rms, felt_band, felt_body, mean_hand_force
 from canwall.physics import HandBody, advance, make_plant
 
 Array = NDArray[np.float64]
@@ -84,7 +84,7 @@ def test_the_mean_force_is_the_integral() -> None:
 
     integral, _ = integrate.quad(force, start, start + period, epsabs=1e-13)
     ends = (y(start), v(start), y(start + period), v(start + period))
-    found = mean_force(body, *ends, 0.15, period)
+    found = mean_hand_force(body, *ends, 0.15, period)
     # The rule for the mean of y is of fourth order; 2e-5 N·m is 0.0002 N at the handle.
     assert found == pytest.approx(integral / period, abs=2e-5)
 
@@ -96,7 +96,7 @@ def test_what_the_hand_feels_is_what_the_handle_gives() -> None:
     joined = make_plant(mass + hand.mass, viscous + hand.viscous, hand.spring)
     y, v = -0.003, -0.2
     y_next, v_next, _ = advance(joined[0], y, v, torque + push, 0.0, period)
-    felt = mean_force(hand, y, v, y_next, v_next, push, period)
+    felt = mean_hand_force(hand, y, v, y_next, v_next, push, period)
     given = torque - (viscous * (y_next - y) + mass * (v_next - v)) / period
     assert felt == pytest.approx(given, rel=1e-6)
     assert abs(felt) > 0.1

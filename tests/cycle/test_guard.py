@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import sosfilt
 
+from canwall.analysis.felt import filtered
 from canwall.config import Settings, load
 from canwall.cycle import guard
 from canwall.run.closed_loop import simulate
@@ -38,7 +39,7 @@ def watched(record: NDArray[np.void], y: Array, force: Array) -> Array:
 def test_band_pass_is_scipy_s_and_has_its_band(period: float) -> None:
     record = made(period=period)
     signal = np.random.default_rng(0).normal(size=500)
-    passed = [guard._filtered(record[0], value) for value in signal]
+    passed = [filtered(record[0]["sections"], record[0]["states"], value) for value in signal]
     np.testing.assert_allclose(passed, sosfilt(record["sections"][0], signal), atol=1e-12)
 
     def gain(frequency: float) -> float:
