@@ -17,11 +17,11 @@ from canwall.units import to_per_mille
 from canwall.walls import (
     acting_force,
     actuation_state,
-    bounded_push,
     change_plant,
     correct,
     correct_bank,
     end_lag,
+    force_for_unknown,
     may_lag,
     note_missing_sample,
     predict,
@@ -143,7 +143,7 @@ def _force_of(cycle: Record, rendered: Record, due: bool) -> float:
         cycle.evaluated = rendered.law + 1
         rendered.force = wall_force(cycle.laws[rendered.law], rendered.wall[0])
         if cycle.bank[0].adapts:
-            rendered.force = bounded_push(cycle.bank[0], rendered.wall[0], rendered.force)
+            rendered.force = force_for_unknown(cycle.bank[0], rendered.wall[0], rendered.force)
         cycle.evaluated = 0
     return cycle.guard[0].factor * rendered.force
 

@@ -54,11 +54,13 @@ BANK = np.dtype(
         # The observer of [y, ẏ, ÿ], its gain, and its state for positions, torque (of a unit mass)
         # and velocity; what it does not expect of them at this sample; the sums of their products.
         ("observer_gain", "f8", (3,)),
+        ("hand_torque", "f8"),  # surprise by a torque that changes as fast as a hand's
         ("observed", "f8", (3, 3)),
         ("surprise", "f8", (3,)),
         ("information", "f8", (3, 3)),
         ("period", "f8"),
         ("delay_share", "f8"),  # of a period, up to the instant of actuation
+        ("explained", "?"),
         ("steady", "i8"),  # samples in a row that moved on in one direction
         ("direction", "f8"),
         # Place of the mass in force on the scale of the filters' numbers.
@@ -69,18 +71,25 @@ BANK = np.dtype(
         ("mass", "f8"),
         ("least_mass", "f8"),  # lightest that is believable
         ("approach", "f8"),  # speed of the approach to the present contact [rad/s]
+        ("probe", "f8"),  # torque before a contact [N·m]
+        ("probed", "i8"),  # samples of the present probe
         ("spread", "f8"),  # standard deviation of ln(mass), as far as the residuals tell
     ],
     align=True,
 )
 
 #: Bandwidth of the observer, faster than what hand and friction do meanwhile [Hz].
-_OBSERVER_HZ = 50.0
+_OBSERVER_HZ = 100.0
 #: Uncertainty of a sample, with all that the model leaves out [counts].
-_UNCERTAINTY = 1.0
+_UNCERTAINTY = 0.5
 #: Samples in one direction after which friction is part of the bias, and the least way of each
 #: [counts]: a handle that sticks is as heavy as the world.
 _STEADY, _LEAST_WAY = 6, 1.5
+_UNTIMELY_MOST = 0.3
+#: Torque that says something whatever friction does, as a multiple of that of a hand.
+_STRONG = 4.0
+#: Surprise that no torque explains [counts]; more is the hand's doing.
+_UNEXPLAINED = 4.0
 #: Share of what is known that is left after a sample that tells as much as those before.
 _MEMORY = 0.98
 #: Before the first torque: standard deviation of m₀/m about 1, with m₀ the lightest mass; mean and
@@ -88,12 +97,25 @@ _MEMORY = 0.98
 _PRIOR_LIGHTNESS, _PRIOR_RATE, _PRIOR_RATE_DEVIATION = 0.7, 100.0, 150.0
 #: Time without torque after which another hand may be at the handle [s].
 _FORGOTTEN_S = 0.2
+#: Standard deviations of 1/m by which the hand in force is lighter than the likeliest one.
+_CAUTION = 1.0
 #: Standard deviations of 1/m up to which a lighter hand is believable.
 _BELIEVABLE = 2.0
 #: Ratio of the mass in force to the lightest believable one from which on a push is bounded.
 _CERTAIN = 1.3
 #: Share of the speed of approach with which a hand of uncertain mass may be returned.
 _RETURNED = 0.9
+#: Time before a contact from which on a probe shows who is coming [s], and half its period
+#: [samples]: as slow as the observer lets through.
+_PROBE_S, _PROBE_SAMPLES = 0.06, 4
+#: Fastest change of a hand's force [N·m/s]. A torque that changes no faster may be its answer to
+#: the hand, and then says nothing of the mass: a wall that gives way to none looks heavy.
+_HAND_RATE = 8.0
+#: Motion of the lightest hand under a probe [counts].
+_PROBE_COUNTS = 4.0
+#: Uncertainty of a torque's course, as a share of its steps: a drive takes them over at ticks of
+#: its own, and its current loop follows as it likes.
+_UNTIMELY = 0.1
 #: Share of the way to the likeliest mass that is gone in a period.
 _FOLLOWED = 0.6
 #: Power of the mass with which the walk of a hand's force falls. What the steps of the encoder make
@@ -143,7 +165,10 @@ def set_bank(
     bank["spring"], bank["resolution"] = spring, abs(count)
     bank["forgotten"] = round(_FORGOTTEN_S / period)
     bank["period"], bank["delay_share"] = period, fraction
+    quarter = 0.5 * _PROBE_SAMPLES * period
+    bank["probe"] = _PROBE_COUNTS * abs(count) * masses[0] / quarter**2
     bank["observer_gain"] = _observer_gain(period)
+    bank["hand_torque"] = _HAND_RATE * period / bank["observer_gain"][0, 2]
     bank["viscous"][0, :n] = viscous
     for i in range(n):
         walk = force_walk * float(masses[0] / masses[i]) ** _STEADINESS
@@ -183,7 +208,7 @@ def reset_bank(bank: NDArray[np.void], y: float) -> None:
     bank["steady"], bank["direction"] = 0, 0.0
     bank["place"] = 0.0
     bank["samples"] = y
-    bank["at_rest"] = 0
+    bank["at_rest"] = bank["probed"] = 0
     bank["approach"] = 0.0
     bank["mass"] = bank["least_mass"] = np.exp(bank["log_lightest"])
     bank["spread"] = 0.0
@@ -209,15 +234,16 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
         state[2, i] += gain[2, i] * residual
     changed = False
     _observe(bank, y_sample)
-    _note_direction(bank, y_sample)
+    _note_direction(bank, estimator, y_sample)
     if _torque_acted(estimator):
         bank.at_rest = 0
-        if bank.steady >= _STEADY:
-            _learn(bank)
+        told = abs(bank.surprise[1]) / bank.hand_torque
+        steady = bank.steady >= _STEADY and (bank.probed > 0 or told > 1.0)
+        if steady or (told > _STRONG and bank.explained):
+            _learn(bank, estimator)
             changed = _follow(bank)
     else:
         bank.at_rest += 1
-        bank.approach = max(-estimator.v, 0.0)
         if bank.at_rest == bank.forgotten:
             changed = _forget(bank)
     k = min(int(bank.place), n - 2)
@@ -251,10 +277,15 @@ def _observe(bank: Record, y_sample: float) -> None:
 
 
 @compiled
-def _note_direction(bank: Record, y_sample: float) -> None:
+def _note_direction(bank: Record, estimator: Record, y_sample: float) -> None:
     way = y_sample - bank.samples[0]
     goes_on = abs(way) >= _LEAST_WAY * bank.resolution and way * bank.direction >= 0.0
-    bank.steady = bank.steady + 1 if goes_on else 0
+    period = bank.period
+    unexplained = abs(bank.surprise[0]) - _UNEXPLAINED * bank.resolution
+    torque = abs(bank.surprise[1]) + _UNTIMELY_MOST * _torque_steps(estimator) * period * period
+    explained = unexplained * _mass_at(bank, 0.0) <= torque
+    bank.steady = bank.steady + 1 if goes_on and explained else 0
+    bank.explained = explained
     bank.direction = way
     for age in range(_RECENT - 1, 0, -1):
         bank.samples[age] = bank.samples[age - 1]
@@ -289,12 +320,38 @@ def _forget(bank: Record) -> bool:
 
 
 @compiled
-def bounded_push(bank: Record, wall: Record, force: float) -> float:
-    """Return a force that throws back no hand that may be at the handle faster than it came in."""
+def force_for_unknown(bank: Record, wall: Record, force: float) -> float:
+    """Return the force for a hand that is not known yet: a law's, bounded, or before it a probe."""
+    if wall.y > 0.0:
+        bank.approach = max(-wall.v, 0.0)
+    if force == 0.0:
+        return _probe(bank, wall)
+    bank.probed = 0
     if bank.mass <= _CERTAIN * bank.least_mass:
         return force
-    outwards = _RETURNED * bank.approach - wall.v
-    return min(force, max(0.0, outwards * bank.least_mass / wall.period - wall.d))
+    return _bounded_push(bank, wall, force)
+
+
+@compiled
+def _bounded_push(bank: Record, wall: Record, force: float) -> float:
+    """Return a force that gives no hand that may be at the handle more energy than it brought."""
+    mass = bank.least_mass
+    brought = bank.approach * bank.approach + 2.0 * max(wall.absorbed, 0.0) / mass
+    outwards = _RETURNED * math.sqrt(brought) - wall.v
+    return min(force, max(0.0, outwards * mass / wall.period - wall.d))
+
+
+@compiled
+def _probe(bank: Record, wall: Record) -> float:
+    """Return a torque to and fro shortly before a contact, by which the hand is known in it."""
+    comes = -wall.v * bank.period >= _LEAST_WAY * bank.resolution
+    if not (comes and 0.0 < wall.y <= -wall.v * _PROBE_S):
+        bank.probed = 0
+        return 0.0
+    # The first half is half as long: the handle is pushed about its own path.
+    swing = (bank.probed + _PROBE_SAMPLES // 2) // _PROBE_SAMPLES
+    bank.probed += 1
+    return bank.probe if swing % 2 == 0 else -bank.probe
 
 
 @compiled
@@ -306,17 +363,29 @@ def _torque_acted(estimator: Record) -> bool:
 
 
 @compiled
-def _learn(bank: Record) -> None:
+def _torque_steps(estimator: Record) -> float:
+    """Return the sum of the last two steps of the torque that acted, without sign [N·m]."""
+    steps = 0.0
+    n = estimator.delay_periods
+    for age in range(n, min(n + 2, MAX_DELAY)):
+        steps += abs(estimator.in_flight[age] - estimator.in_flight[age + 1])
+    return steps
+
+
+@compiled
+def _learn(bank: Record, estimator: Record) -> None:
     """Add what this sample tells; in return as much of what was known is forgotten."""
     r, information = bank.surprise, bank.information
-    tells = r[1] * r[1]
+    untimely = _UNTIMELY * _torque_steps(estimator) * bank.period * bank.period / bank.mass
+    weight = 1.0 / ((_UNCERTAINTY * bank.resolution) ** 2 + untimely * untimely)
+    tells = weight * r[1] * r[1]
     share = 1.0
     if tells < (1.0 - _MEMORY) * information[1, 1]:
         share = tells / ((1.0 - _MEMORY) * information[1, 1])
     left = 1.0 - (1.0 - _MEMORY) * share
     for i in range(3):
         for c in range(3):
-            information[i, c] = left * information[i, c] + r[i] * r[c]
+            information[i, c] = left * information[i, c] + weight * r[i] * r[c]
 
 
 @compiled
@@ -326,19 +395,18 @@ def _follow(bank: Record) -> bool:
     The least squares of r₀ + r₁·(1/m) − r₂·(b/m), with what is known before the first torque.
     """
     lightest = _mass_at(bank, 0.0)
-    variance = (_UNCERTAINTY * bank.resolution) ** 2
     s = bank.information
     of_lightness = (lightest / _PRIOR_LIGHTNESS) ** 2
     of_rate = 1.0 / _PRIOR_RATE_DEVIATION**2
-    p11, p12 = s[1, 1] / variance + of_lightness, -s[1, 2] / variance
-    p22 = s[2, 2] / variance + of_rate
-    q1 = -s[0, 1] / variance + of_lightness / lightest
-    q2 = s[0, 2] / variance + of_rate * _PRIOR_RATE
+    p11, p12 = s[1, 1] + of_lightness, -s[1, 2]
+    p22 = s[2, 2] + of_rate
+    q1 = -s[0, 1] + of_lightness / lightest
+    q2 = s[0, 2] + of_rate * _PRIOR_RATE
     determinant = p11 * p22 - p12 * p12
     lightness = (q1 * p22 - q2 * p12) / determinant
     deviation = math.sqrt(p22 / determinant)
     bank.spread = deviation / max(lightness, deviation)
-    step = _FOLLOWED * (_place_of(bank, lightness) - bank.place)
+    step = _FOLLOWED * (_place_of(bank, lightness + _CAUTION * deviation) - bank.place)
     bank.place += step
     bank.mass = _mass_at(bank, bank.place)
     believable = _place_of(bank, lightness + _BELIEVABLE * deviation)
