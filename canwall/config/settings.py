@@ -72,7 +72,8 @@ class Estimator(Section):
 
     Attributes:
         force_walk_nm_per_sqrt_s: Random walk of the operator's force. Default: 0.2; with
-            operator.adapt 0.02 for the lightest hand, and less for heavier ones.
+            operator.adapt so much for the lightest hand that the filter is as quick as the delay
+            is short, and less for heavier ones.
         delay_cycles: Delay D from the sampling of a position until the torque computed from it
             takes effect, in cycles. Default: 1 with synchronous PDOs; measured with others.
         measure_delay: Always measure the delay before the wall is rendered.
@@ -272,14 +273,6 @@ class Settings(Section):
         drive = self.drive.model_copy(update={"drive_cycle_s": 0.0, "current_bandwidth_hz": 0.0})
         simulation = self.simulation and self.simulation.with_ideal_servo()
         return self.model_copy(update={"drive": drive, "simulation": simulation})
-
-    @property
-    def force_walk(self) -> float:
-        """Random walk of the operator's force in the model of the laws [N·m/√s]."""
-        given = self.estimator.force_walk_nm_per_sqrt_s
-        if given is not None:
-            return given
-        return 0.02 if self.operator.adapt else 0.2
 
     @property
     def embedded(self) -> bool:

@@ -22,6 +22,7 @@ from canwall.walls import (
     Law,
     clear_memory,
     find_law,
+    force_walk_of,
     hand_damping,
     reset_bank,
     reset_estimator,
@@ -40,6 +41,10 @@ RECENT_CYCLES = 50
 #: Delay of a torque carried by a synchronous RPDO (theory, section 3).
 SYNCHRONOUS_DELAY = 1.0
 
+#: Random walk of a force, for a hand that is known [N·m/√s].
+_FORCE_WALK = 0.2
+#: Delay below which the filter of an unknown hand becomes no quicker [periods].
+_SHORTEST_DELAY = 0.5
 #: Missed motion below this is ignored, since a coarse encoder stays on one count for long [counts].
 _STUCK_COUNTS = 8
 #: Tolerance for rounding, one count at each end of a cycle.
@@ -233,9 +238,14 @@ def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None
     """Reset the estimator for a delay of `delay` periods. Raises ValueError."""
     mass, viscous, spring = _model(settings)
     coulomb, period = settings.mechanics.coulomb_nm, settings.bus.cycle_s
-    count, force_walk = float(cycle["rad_per_count"][0]), settings.force_walk
+    count = float(cycle["rad_per_count"][0])
+    force_walk = settings.estimator.force_walk_nm_per_sqrt_s or _FORCE_WALK
     if settings.operator.adapt:
         masses, dampings = _hands(settings)
+        if settings.estimator.force_walk_nm_per_sqrt_s is None:
+            # A filter that follows within the delay is as quick as the loop can bear.
+            bandwidth = 1.0 / (max(delay, _SHORTEST_DELAY) * period)
+            force_walk = force_walk_of(bandwidth, masses[0], period, abs(count))
         bank = cycle["bank"][0]
         set_bank(bank, masses, dampings, spring, period, count, force_walk, delay)
         mass, viscous, coulomb = masses[0], dampings[0], 0.0

@@ -56,10 +56,11 @@ BANK = np.dtype(
         ("observer_gain", "f8", (3,)),
         ("hand_torque", "f8"),  # surprise by a torque that changes as fast as a hand's
         ("observed", "f8", (3, 3)),
-        ("surprise", "f8", (3,)),
-        ("information", "f8", (3, 3)),
+        ("surprise", "f8", (4,)),
+        ("information", "f8", (4, 4)),
         ("period", "f8"),
         ("delay_share", "f8"),  # of a period, up to the instant of actuation
+        ("noise", "f8"),  # mean square of what nothing explains [rad²]
         ("explained", "?"),
         ("steady", "i8"),  # samples in a row that moved on in one direction
         ("direction", "f8"),
@@ -80,21 +81,26 @@ BANK = np.dtype(
 
 #: Bandwidth of the observer, faster than what hand and friction do meanwhile [Hz].
 _OBSERVER_HZ = 100.0
-#: Uncertainty of a sample, with all that the model leaves out [counts].
-_UNCERTAINTY = 0.5
+#: Noise of the observer's surprise by the steps of the encoder [counts], and share of the noise
+#: that is exchanged with a sample: drives latch their position at ticks of their own.
+_QUANTISATION, _NOISE_SHARE = 0.5, 1.0 / 16.0
 #: Samples in one direction after which friction is part of the bias, and the least way of each
 #: [counts]: a handle that sticks is as heavy as the world.
 _STEADY, _LEAST_WAY = 6, 1.5
 _UNTIMELY_MOST = 0.3
 #: Torque that says something whatever friction does, as a multiple of that of a hand.
 _STRONG = 4.0
-#: Surprise that no torque explains [counts]; more is the hand's doing.
-_UNEXPLAINED = 4.0
+#: Surprise that no torque explains, as a multiple of the noise; more is the hand's doing.
+_UNEXPLAINED = 6.0
 #: Share of what is known that is left after a sample that tells as much as those before.
 _MEMORY = 0.98
+#: The same after a sample that no torque explains.
+_DOUBTED = 0.8
 #: Before the first torque: standard deviation of m₀/m about 1, with m₀ the lightest mass; mean and
 #: standard deviation of b/m [1/s].
 _PRIOR_LIGHTNESS, _PRIOR_RATE, _PRIOR_RATE_DEVIATION = 0.7, 100.0, 150.0
+#: Standard deviation of the surprise by a hand whose force changes steadily [counts].
+_PRIOR_STEADY = 4.0
 #: Time without torque after which another hand may be at the handle [s].
 _FORGOTTEN_S = 0.2
 #: Standard deviations of 1/m by which the hand in force is lighter than the likeliest one.
@@ -168,6 +174,7 @@ def set_bank(
     quarter = 0.5 * _PROBE_SAMPLES * period
     bank["probe"] = _PROBE_COUNTS * abs(count) * masses[0] / quarter**2
     bank["observer_gain"] = _observer_gain(period)
+    bank["surprise"][0, 3] = abs(count)
     bank["hand_torque"] = _HAND_RATE * period / bank["observer_gain"][0, 2]
     bank["viscous"][0, :n] = viscous
     for i in range(n):
@@ -209,6 +216,7 @@ def reset_bank(bank: NDArray[np.void], y: float) -> None:
     bank["place"] = 0.0
     bank["samples"] = y
     bank["at_rest"] = bank["probed"] = 0
+    bank["noise"] = (_QUANTISATION * bank["resolution"]) ** 2
     bank["approach"] = 0.0
     bank["mass"] = bank["least_mass"] = np.exp(bank["log_lightest"])
     bank["spread"] = 0.0
@@ -235,12 +243,17 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
     changed = False
     _observe(bank, y_sample)
     _note_direction(bank, estimator, y_sample)
+    told = abs(bank.surprise[1]) / bank.hand_torque
+    if told <= 1.0:
+        _note_noise(bank)
     if _torque_acted(estimator):
         bank.at_rest = 0
-        told = abs(bank.surprise[1]) / bank.hand_torque
         steady = bank.steady >= _STEADY and (bank.probed > 0 or told > 1.0)
         if steady or (told > _STRONG and bank.explained):
             _learn(bank, estimator)
+            changed = _follow(bank)
+        elif not bank.explained:
+            _doubt(bank)
             changed = _follow(bank)
     else:
         bank.at_rest += 1
@@ -277,11 +290,19 @@ def _observe(bank: Record, y_sample: float) -> None:
 
 
 @compiled
+def _note_noise(bank: Record) -> None:
+    rest = bank.surprise[0] + bank.surprise[1] / bank.mass
+    square = min(rest * rest, _UNEXPLAINED**2 * bank.noise)
+    bank.noise += _NOISE_SHARE * (square - bank.noise)
+    bank.noise = max(bank.noise, (_QUANTISATION * bank.resolution) ** 2)
+
+
+@compiled
 def _note_direction(bank: Record, estimator: Record, y_sample: float) -> None:
     way = y_sample - bank.samples[0]
     goes_on = abs(way) >= _LEAST_WAY * bank.resolution and way * bank.direction >= 0.0
     period = bank.period
-    unexplained = abs(bank.surprise[0]) - _UNEXPLAINED * bank.resolution
+    unexplained = abs(bank.surprise[0]) - _UNEXPLAINED * math.sqrt(bank.noise)
     torque = abs(bank.surprise[1]) + _UNTIMELY_MOST * _torque_steps(estimator) * period * period
     explained = unexplained * _mass_at(bank, 0.0) <= torque
     bank.steady = bank.steady + 1 if goes_on and explained else 0
@@ -377,31 +398,43 @@ def _learn(bank: Record, estimator: Record) -> None:
     """Add what this sample tells; in return as much of what was known is forgotten."""
     r, information = bank.surprise, bank.information
     untimely = _UNTIMELY * _torque_steps(estimator) * bank.period * bank.period / bank.mass
-    weight = 1.0 / ((_UNCERTAINTY * bank.resolution) ** 2 + untimely * untimely)
+    weight = 1.0 / (bank.noise + untimely * untimely)
     tells = weight * r[1] * r[1]
     share = 1.0
     if tells < (1.0 - _MEMORY) * information[1, 1]:
         share = tells / ((1.0 - _MEMORY) * information[1, 1])
     left = 1.0 - (1.0 - _MEMORY) * share
-    for i in range(3):
-        for c in range(3):
+    for i in range(4):
+        for c in range(4):
             information[i, c] = left * information[i, c] + weight * r[i] * r[c]
+
+
+@compiled
+def _doubt(bank: Record) -> None:
+    """Forget of what is known: something happens that it does not explain."""
+    for i in range(4):
+        for c in range(4):
+            bank.information[i, c] *= _DOUBTED
 
 
 @compiled
 def _follow(bank: Record) -> bool:
     """Move the mass in force towards the likeliest one; return True if it moved.
 
-    The least squares of r₀ + r₁·(1/m) − r₂·(b/m), with what is known before the first torque.
+    The least squares of r₀ + r₁·(1/m) − r₂·(b/m) − r₃·c, with what is known before the first
+    torque. c is of a hand whose force changes steadily.
     """
     lightest = _mass_at(bank, 0.0)
     s = bank.information
+    # What goes on all the time is the hand's: r₃ is eliminated.
+    r03, r13, r23 = s[0, 3], s[1, 3], s[2, 3]
+    steady = s[3, 3] + 1.0 / _PRIOR_STEADY**2
     of_lightness = (lightest / _PRIOR_LIGHTNESS) ** 2
     of_rate = 1.0 / _PRIOR_RATE_DEVIATION**2
-    p11, p12 = s[1, 1] + of_lightness, -s[1, 2]
-    p22 = s[2, 2] + of_rate
-    q1 = -s[0, 1] + of_lightness / lightest
-    q2 = s[0, 2] + of_rate * _PRIOR_RATE
+    p11, p12 = s[1, 1] - r13 * r13 / steady + of_lightness, -(s[1, 2] - r13 * r23 / steady)
+    p22 = s[2, 2] - r23 * r23 / steady + of_rate
+    q1 = -(s[0, 1] - r03 * r13 / steady) + of_lightness / lightest
+    q2 = s[0, 2] - r03 * r23 / steady + of_rate * _PRIOR_RATE
     determinant = p11 * p22 - p12 * p12
     lightness = (q1 * p22 - q2 * p12) / determinant
     deviation = math.sqrt(p22 / determinant)

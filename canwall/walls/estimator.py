@@ -115,6 +115,14 @@ def kalman_model(
     return KalmanModel(a, force_noise, prior, gain[:, 0] * scale / count, scale)
 
 
+def force_walk_of(bandwidth: float, mass: float, period: float, count: float) -> float:
+    """Return the walk q of a force [N·m/√s] that gives the filter this bandwidth [rad/s].
+
+    See `kalman_model`, of which it is the inverse for a pure mass.
+    """
+    return bandwidth**3 * mass * count * math.sqrt(_QUANTISATION * period)
+
+
 def set_estimator(
     estimator: NDArray[np.void],
     mass: float,

@@ -25,7 +25,6 @@ def unknown_hand(servo: Servo, law: str = "mean_force", **keys: Any) -> dict[str
         **_DRIVE,
         "drive.drive_cycle_s": servo.drive_cycle_s,
         "drive.current_bandwidth_hz": 1.0 / (2.0 * math.pi * servo.lag_s),
-        "estimator.force_walk_nm_per_sqrt_s": 0.02,
         "operator.adapt": True,
         "wall.law": law,
         "wall.damping_ratio": 0.5,
