@@ -103,8 +103,6 @@ _PRIOR_LIGHTNESS, _PRIOR_RATE, _PRIOR_RATE_DEVIATION = 0.7, 100.0, 150.0
 _PRIOR_STEADY = 4.0
 #: Time without torque after which another hand may be at the handle [s].
 _FORGOTTEN_S = 0.2
-#: Standard deviations of 1/m by which the hand in force is lighter than the likeliest one.
-_CAUTION = 1.0
 #: Standard deviations of 1/m up to which a lighter hand is believable.
 _BELIEVABLE = 2.0
 #: Ratio of the mass in force to the lightest believable one from which on a push is bounded.
@@ -439,7 +437,7 @@ def _follow(bank: Record) -> bool:
     lightness = (q1 * p22 - q2 * p12) / determinant
     deviation = math.sqrt(p22 / determinant)
     bank.spread = deviation / max(lightness, deviation)
-    step = _FOLLOWED * (_place_of(bank, lightness + _CAUTION * deviation) - bank.place)
+    step = _FOLLOWED * (_place_of(bank, lightness) - bank.place)
     bank.place += step
     bank.mass = _mass_at(bank, bank.place)
     believable = _place_of(bank, lightness + _BELIEVABLE * deviation)
