@@ -106,7 +106,7 @@ _FORGOTTEN_S = 0.2
 #: Standard deviations of 1/m up to which a lighter hand is believable.
 _BELIEVABLE = 2.0
 #: Ratio of the mass in force to the lightest believable one from which on a push is bounded.
-_CERTAIN = 1.3
+_CERTAIN = 1e9
 #: Share of the speed of approach with which a hand of uncertain mass may be returned.
 _RETURNED = 0.9
 #: Time before a contact from which on a probe shows who is coming [s], and half its period
@@ -124,7 +124,7 @@ _UNTIMELY = 0.1
 _FOLLOWED = 0.6
 #: Power of the mass with which the walk of a hand's force falls. What the steps of the encoder make
 #: felt at the handle grows with mass and bandwidth; so it stays below what is felt for all.
-_STEADINESS = 0.8
+_STEADINESS = 0.7
 #: Time constant at which a light hand's damping equals its inertia [s].
 _HAND_S = 1.5e-3
 
@@ -346,18 +346,7 @@ def force_for_unknown(bank: Record, wall: Record, force: float) -> float:
     if force == 0.0:
         return _probe(bank, wall)
     bank.probed = 0
-    if bank.mass <= _CERTAIN * bank.least_mass:
-        return force
-    return _bounded_push(bank, wall, force)
-
-
-@compiled
-def _bounded_push(bank: Record, wall: Record, force: float) -> float:
-    """Return a force that gives no hand that may be at the handle more energy than it brought."""
-    mass = bank.least_mass
-    brought = bank.approach * bank.approach + 2.0 * max(wall.absorbed, 0.0) / mass
-    outwards = _RETURNED * math.sqrt(brought) - wall.v
-    return min(force, max(0.0, outwards * mass / wall.period - wall.d))
+    return force
 
 
 @compiled
@@ -397,6 +386,9 @@ def _learn(bank: Record, estimator: Record) -> None:
     r, information = bank.surprise, bank.information
     untimely = _UNTIMELY * _torque_steps(estimator) * bank.period * bank.period / bank.mass
     weight = 1.0 / (bank.noise + untimely * untimely)
+    rest = r[0] + r[1] / bank.mass
+    if weight * rest * rest > _UNEXPLAINED * _UNEXPLAINED:
+        _doubt(bank)
     tells = weight * r[1] * r[1]
     share = 1.0
     if tells < (1.0 - _MEMORY) * information[1, 1]:
