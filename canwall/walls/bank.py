@@ -95,7 +95,7 @@ _UNEXPLAINED = 6.0
 #: Share of what is known that is left after a sample that tells as much as those before.
 _MEMORY = 0.98
 #: The same after a sample that no torque explains.
-_DOUBTED = 0.8
+_DOUBTED = 0.1
 #: Before the first torque: standard deviation of m₀/m about 1, with m₀ the lightest mass; mean and
 #: standard deviation of b/m [1/s].
 _PRIOR_LIGHTNESS, _PRIOR_RATE, _PRIOR_RATE_DEVIATION = 0.7, 100.0, 150.0
