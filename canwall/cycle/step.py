@@ -21,7 +21,6 @@ from canwall.walls import (
     correct,
     correct_bank,
     end_lag,
-    force_for_unknown,
     may_lag,
     note_missing_sample,
     predict,
@@ -33,6 +32,7 @@ from canwall.walls import (
     start_lagging,
     surprise,
     wall_force,
+    with_probe,
 )
 
 # The enums' values as plain numbers for the compiled code.
@@ -143,7 +143,7 @@ def _force_of(cycle: Record, rendered: Record, due: bool) -> float:
         cycle.evaluated = rendered.law + 1
         rendered.force = wall_force(cycle.laws[rendered.law], rendered.wall[0])
         if cycle.bank[0].adapts:
-            rendered.force = force_for_unknown(cycle.bank[0], rendered.wall[0], rendered.force)
+            rendered.force = with_probe(cycle.bank[0], rendered.wall[0], rendered.force)
         cycle.evaluated = 0
     return cycle.guard[0].factor * rendered.force
 

@@ -8,11 +8,11 @@ from canwall.walls.bank import (
     BANK,
     MAX_FILTERS,
     correct_bank,
-    force_for_unknown,
     hand_damping,
     predict_bank,
     reset_bank,
     set_bank,
+    with_probe,
 )
 from canwall.walls.estimator import (
     ESTIMATOR,
@@ -71,7 +71,6 @@ __all__ = [
     "correct_bank",
     "end_lag",
     "find_law",
-    "force_for_unknown",
     "force_walk_of",
     "hand_damping",
     "law",
@@ -93,4 +92,5 @@ __all__ = [
     "start_open_loop",
     "surprise",
     "wall_force",
+    "with_probe",
 ]

@@ -86,7 +86,7 @@ def pulses(size: float) -> NDArray[np.float64]:
 
 @pytest.mark.parametrize("mass", [1.3e-4, 4.2e-4, 1.4e-3, 3.6e-3])
 def test_mass_is_found_within_samples_of_the_first_torque(mass: float) -> None:
-    found = play(*bank_at(0.0), mass, pulses(300.0 * mass))
+    found = play(*bank_at(0.0), mass, pulses(max(0.4, 300.0 * mass)))
     # The lightest until a torque has acted, which takes two periods and a sample.
     np.testing.assert_allclose(found[:62], MASSES[0], rtol=1e-12)
     np.testing.assert_allclose(found[72:], mass, rtol=0.15)
@@ -96,7 +96,7 @@ def test_state_is_that_of_the_matching_filter_alone() -> None:
     bank, estimator = bank_at(0.0)
     play(bank, estimator, float(MASSES[8]), pulses(0.3))
     alone = np.zeros(1, ESTIMATOR)
-    walk = WALK * (MASSES[0] / MASSES[8]) ** 0.8
+    walk = WALK * (MASSES[0] / MASSES[8]) ** 0.7
     set_estimator(alone, MASSES[8], VISCOUS[8], 0.0, 0.0, PERIOD, COUNT, walk, DELAY)
     reset_estimator(alone, 0.0)
     play(None, alone, float(MASSES[8]), pulses(0.3))

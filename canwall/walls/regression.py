@@ -1,0 +1,284 @@
+"""The mass at the handle, by a regression on what an observer does not expect.
+
+One fast observer, with a bias of its own, follows the positions without any torque, the torque
+alone, and the velocity alone. What it does not expect of the positions is −1/m times the same of
+the torque, plus b/m times that of the velocity, plus something steady from a hand whose force
+changes steadily. What changes more slowly (the operator's push, friction in one direction) is in
+none of them.
+
+The torque is the wall's, or a probe's: shortly before a contact the handle is pushed to and fro by
+a few counts, so that a light hand is told from a heavy one before the wall acts.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canwall.compiled import Record, compiled
+from canwall.walls.estimator import MAX_DELAY
+
+#: Number of samples that are kept: two differences give the velocity to come.
+_RECENT = 3
+
+#: A regression.
+REGRESSION = np.dtype(
+    [
+        ("period", "f8"),
+        ("resolution", "f8"),  # one count [rad]
+        ("lightest", "f8"),  # smallest mass that there may be
+        ("delay_share", "f8"),  # of a period, up to the instant of actuation
+        # The observer of [y, ẏ, ÿ], its gain, and its state for positions, torque (of a unit mass)
+        # and velocity; what it does not expect of them at this sample, and one count.
+        ("gain", "f8", (3,)),
+        ("observed", "f8", (3, 3)),
+        ("surprise", "f8", (4,)),
+        ("information", "f8", (4, 4)),  # weighted sums of their products
+        ("noise", "f8"),  # mean square of what nothing explains [rad²]
+        ("hand_torque", "f8"),  # surprise by a torque that changes as fast as a hand's
+        ("samples", "f8", (_RECENT,)),  # the last ones, newest first [rad]
+        ("way", "f8"),  # to the last sample [rad]
+        ("steady", "i8"),  # samples in a row that moved on in one direction
+        ("probe", "f8"),  # torque before a contact [N·m]
+        ("probed", "i8"),  # samples of the present probe
+    ],
+    align=True,
+)
+
+#: Bandwidth of the observer, faster than what hand and friction do meanwhile [Hz].
+_OBSERVER_HZ = 100.0
+#: Noise of its surprise by the steps of the encoder [counts], and share of the noise that is
+#: exchanged with a sample: drives latch their position at ticks of their own.
+_QUANTISATION, _NOISE_SHARE = 0.5, 1.0 / 16.0
+#: Samples in one direction after which friction is part of the bias, and the least way of each
+#: [counts]: a handle that sticks is as heavy as the world.
+_STEADY, _LEAST_WAY = 6, 1.5
+#: Fastest change of a hand's force [N·m/s]. A torque that changes no faster may be its answer to
+#: the hand, and then says nothing of the mass: a wall that gives way to none looks heavy.
+_HAND_RATE = 8.0
+#: Torque that says something whatever friction does, as a multiple of that of a hand.
+_STRONG = 4.0
+#: Uncertainty of a torque's course, as a share of its steps, as it usually is and at the most: a
+#: drive takes them over at ticks of its own, and its current loop follows as it likes.
+_UNTIMELY, _UNTIMELY_MOST = 0.1, 0.3
+#: Surprise that is explained by none, as a multiple of the noise.
+_UNEXPLAINED = 6.0
+#: Share of what is known that is left after a sample that tells as much as those before, and after
+#: one that nothing explains: another hand, or a blow.
+_MEMORY, _DOUBTED = 0.98, 0.1
+#: Before the first torque: standard deviation of m₀/m about 1, with m₀ the lightest mass; mean and
+#: standard deviation of b/m [1/s]; standard deviation of what is steady [counts].
+_PRIOR_LIGHTNESS, _PRIOR_RATE, _PRIOR_RATE_DEVIATION, _PRIOR_STEADY = 0.7, 100.0, 150.0, 4.0
+#: Time before a contact from which on the handle is probed [s], and half the period of the probe
+#: [samples]: as slow as the observer lets through.
+_PROBE_S, _PROBE_SAMPLES = 0.06, 4
+#: Motion of the lightest hand under the probe, from end to end [counts].
+_PROBE_COUNTS = 4.0
+
+
+def set_regression(
+    regression: np.void, lightest: float, period: float, count: float, delay: float
+) -> None:
+    """Write a regression's settings.
+
+    Args:
+        regression: A record REGRESSION.
+        lightest: Smallest mass that there may be.
+        period: T [s].
+        count: One count of the encoder [rad].
+        delay: D in periods; its fraction counts.
+    """
+    regression["period"], regression["resolution"] = period, abs(count)
+    regression["lightest"] = lightest
+    regression["delay_share"] = delay - math.floor(delay)
+    regression["gain"] = gain = _observer_gain(period)
+    regression["surprise"][3] = abs(count)
+    regression["hand_torque"] = _HAND_RATE * period / gain[2]
+    quarter = 0.5 * _PROBE_SAMPLES * period
+    regression["probe"] = _PROBE_COUNTS * abs(count) * lightest / quarter**2
+
+
+def _observer_gain(period: float) -> NDArray[np.float64]:
+    """Return the gain that gives the observer of [y, ẏ, ÿ] three equal poles p.
+
+    They are at its bandwidth, but no faster than a tenth of the sample rate. It is the
+    fading-memory filter of third order: 1 − p³, 1.5·(1 − p)²·(1 + p)/T, (1 − p)³/T².
+    """
+    pole = math.exp(-2.0 * math.pi * min(_OBSERVER_HZ * period, 0.1))
+    rest = 1.0 - pole
+    return np.array([1.0 - pole**3, 1.5 * rest**2 * (1.0 + pole) / period, rest**3 / period**2])
+
+
+def reset_regression(regression: np.void, y: float) -> None:
+    """Begin at rest at y, with nothing known of the mass."""
+    for name in ("observed", "information", "way", "steady", "probed"):
+        regression[name] = 0
+    regression["observed"][0, 0] = y
+    regression["samples"] = y
+    regression["noise"] = (_QUANTISATION * regression["resolution"]) ** 2
+
+
+@compiled
+def begin_regression(regression: Record, y: float) -> None:
+    """Begin at rest at y; what is known of the mass stays."""
+    regression.observed[:] = 0.0
+    regression.observed[0, 0] = y
+    regression.samples[:] = y
+    regression.way = 0.0
+    regression.steady = regression.probed = 0
+    regression.noise = (_QUANTISATION * regression.resolution) ** 2
+
+
+@compiled
+def forget_mass(regression: Record) -> None:
+    """Forget all that is known of the mass."""
+    regression.information[:] = 0.0
+
+
+@compiled
+def learn(regression: Record, estimator: Record, y_sample: float, mass: float) -> bool:
+    """Learn from a sample; return True if what is known of the mass has changed.
+
+    estimator: with the torques in flight. mass: the one in force.
+    """
+    _observe(regression, y_sample)
+    steps = _torque_steps(estimator) * regression.period * regression.period
+    explained = _is_explained(regression, steps)
+    _note_way(regression, y_sample, explained)
+    told = abs(regression.surprise[1]) / regression.hand_torque
+    if told <= 1.0:
+        _note_noise(regression, mass)
+    if not explained:
+        _doubt(regression)
+        return True
+    tells = regression.steady >= _STEADY and (regression.probed > 0 or told > 1.0)
+    if tells or told > _STRONG:
+        _add_information(regression, _UNTIMELY * steps / mass, mass)
+        return True
+    return False
+
+
+@compiled
+def _observe(regression: Record, y_sample: float) -> None:
+    """Correct the observer: what it did not expect of the sample, of torque and of velocity."""
+    surprise, observed = regression.surprise, regression.observed
+    for c in range(3):
+        surprise[c] = (y_sample if c == 0 else 0.0) - observed[0, c]
+        for i in range(3):
+            observed[i, c] += regression.gain[i] * surprise[c]
+
+
+@compiled
+def _torque_steps(estimator: Record) -> float:
+    """Return the sum of the last two steps of the torque that acted, without sign [N·m]."""
+    steps = 0.0
+    n = estimator.delay_periods
+    for age in range(n, min(n + 2, MAX_DELAY)):
+        steps += abs(estimator.in_flight[age] - estimator.in_flight[age + 1])
+    return steps
+
+
+@compiled
+def _is_explained(regression: Record, steps: float) -> bool:
+    """Return True if there is a mass for which the torque explains the motion."""
+    rest = abs(regression.surprise[0]) - _UNEXPLAINED * math.sqrt(regression.noise)
+    torque = abs(regression.surprise[1]) + _UNTIMELY_MOST * steps
+    return rest * regression.lightest <= torque
+
+
+@compiled
+def _note_way(regression: Record, y_sample: float, explained: bool) -> None:
+    way = y_sample - regression.samples[0]
+    goes_on = abs(way) >= _LEAST_WAY * regression.resolution and way * regression.way >= 0.0
+    regression.steady = regression.steady + 1 if goes_on and explained else 0
+    regression.way = way
+    for age in range(_RECENT - 1, 0, -1):
+        regression.samples[age] = regression.samples[age - 1]
+    regression.samples[0] = y_sample
+
+
+@compiled
+def _note_noise(regression: Record, mass: float) -> None:
+    rest = regression.surprise[0] + regression.surprise[1] / mass
+    square = min(rest * rest, _UNEXPLAINED * _UNEXPLAINED * regression.noise)
+    noise = regression.noise + _NOISE_SHARE * (square - regression.noise)
+    regression.noise = max(noise, (_QUANTISATION * regression.resolution) ** 2)
+
+
+@compiled
+def _add_information(regression: Record, untimely: float, mass: float) -> None:
+    """Add what this sample tells; in return as much of what was known is forgotten.
+
+    untimely: uncertainty of the motion by that of the torque's course [rad].
+    """
+    r, information = regression.surprise, regression.information
+    weight = 1.0 / (regression.noise + untimely * untimely)
+    rest = r[0] + r[1] / mass
+    if weight * rest * rest > _UNEXPLAINED * _UNEXPLAINED:
+        _doubt(regression)
+    exchanged = min(1.0 - _MEMORY, weight * r[1] * r[1] / max(information[1, 1], 1e-300))
+    for i in range(4):
+        for c in range(4):
+            information[i, c] = (1.0 - exchanged) * information[i, c] + weight * r[i] * r[c]
+
+
+@compiled
+def _doubt(regression: Record) -> None:
+    information = regression.information
+    for i in range(4):
+        for c in range(4):
+            information[i, c] *= _DOUBTED
+
+
+@compiled
+def lightness(regression: Record) -> tuple[float, float]:
+    """Return the likeliest 1/m and its standard deviation.
+
+    They are the least squares of r₀ + r₁·(1/m) − r₂·(b/m) − r₃·c, with what is known before the
+    first torque; c is what is steady.
+    """
+    s, lightest = regression.information, regression.lightest
+    # r₃ is eliminated.
+    r03, r13, r23 = s[0, 3], s[1, 3], s[2, 3]
+    steady = s[3, 3] + 1.0 / _PRIOR_STEADY**2
+    of_lightness = (lightest / _PRIOR_LIGHTNESS) ** 2
+    of_rate = 1.0 / _PRIOR_RATE_DEVIATION**2
+    p11, p12 = s[1, 1] - r13 * r13 / steady + of_lightness, -(s[1, 2] - r13 * r23 / steady)
+    p22 = s[2, 2] - r23 * r23 / steady + of_rate
+    q1 = -(s[0, 1] - r03 * r13 / steady) + of_lightness / lightest
+    q2 = s[0, 2] - r03 * r23 / steady + of_rate * _PRIOR_RATE
+    determinant = p11 * p22 - p12 * p12
+    return (q1 * p22 - q2 * p12) / determinant, math.sqrt(p22 / determinant)
+
+
+@compiled
+def predict_regression(regression: Record, older: float, newer: float) -> None:
+    """Advance the observer by a period under the torques before and after the actuation."""
+    t, share, x = regression.period, regression.delay_share, regression.observed
+    for c in range(3):
+        x[0, c] += t * x[1, c] + 0.5 * t * t * x[2, c]
+        x[1, c] += t * x[2, c]
+    rest = 1.0 - share
+    x[0, 1] += t * t * (share * (1.0 - 0.5 * share) * older + 0.5 * rest * rest * newer)
+    x[1, 1] += t * (share * older + rest * newer)
+    y = regression.samples
+    # In the middle of the coming period, extrapolated from the middles of the last two.
+    v = (2.0 * y[0] - 3.0 * y[1] + y[2]) / t
+    x[0, 2] += 0.5 * t * t * v
+    x[1, 2] += t * v
+
+
+@compiled
+def probe(regression: Record, wall: Record) -> float:
+    """Return a torque to and fro if the handle is about to come into contact, else zero.
+
+    To be called while the wall gives no force.
+    """
+    comes = -wall.v * regression.period >= _LEAST_WAY * regression.resolution
+    if not (comes and 0.0 < wall.y <= -wall.v * _PROBE_S):
+        regression.probed = 0
+        return 0.0
+    # The first half is half as long: the handle is pushed about its own path.
+    swing = (regression.probed + _PROBE_SAMPLES // 2) // _PROBE_SAMPLES
+    regression.probed += 1
+    return regression.probe if swing % 2 == 0 else -regression.probe

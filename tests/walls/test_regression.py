@@ -1,0 +1,121 @@
+"""The regression that finds the mass at the handle, and its probe."""
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.signal import place_poles
+
+from canwall.walls import ESTIMATOR, WALL
+from canwall.walls.regression import (
+    REGRESSION,
+    learn,
+    lightness,
+    predict_regression,
+    probe,
+    reset_regression,
+    set_regression,
+)
+
+PERIOD, COUNT, LIGHTEST = 1e-3, 4.8e-5, 1e-4
+Array = NDArray[np.float64]
+
+
+def made() -> NDArray[np.void]:
+    regression = np.zeros(1, REGRESSION)
+    set_regression(regression[0], LIGHTEST, PERIOD, COUNT, 1.0)
+    reset_regression(regression[0], 0.0)
+    return regression
+
+
+def play(mass: float, torques: Array, push: Array, jitter: float = 0.0) -> tuple[float, float]:
+    """Return 1/m and its deviation after torques that act at once, beside a hand's push."""
+    regression, estimator = made(), np.zeros(1, ESTIMATOR)
+    rng = np.random.default_rng(1)
+    y, v = 0.0, -0.5
+    for torque, pushed in zip(torques.tolist(), push.tolist(), strict=True):
+        sample = COUNT * round((y + jitter * v * rng.uniform(-0.5, 0.5)) / COUNT)
+        learn(regression[0], estimator[0], sample, 1.0 / max(lightness(regression[0])[0], 200.0))
+        predict_regression(regression[0], torque, torque)
+        estimator["in_flight"][0] = np.roll(estimator["in_flight"][0], 1)
+        estimator["in_flight"][0, 0] = torque
+        a = (torque + pushed - 0.01 * v) / mass
+        y, v = y + PERIOD * v + 0.5 * PERIOD**2 * a, v + PERIOD * a
+    return lightness(regression[0])
+
+
+def test_observer_has_three_equal_poles() -> None:
+    regression = made()[0]
+    pole = math.exp(-0.2 * math.pi)
+    a = np.array([[1.0, PERIOD, 0.5 * PERIOD**2], [0.0, 1.0, PERIOD], [0.0, 0.0, 1.0]])
+    c = np.array([[1.0, 0.0, 0.0]])
+    closed = a @ (np.eye(3) - regression["gain"][:, None] @ c)
+    np.testing.assert_allclose(np.poly(closed), np.poly([pole] * 3), rtol=1e-9)
+    # scipy's placement wants poles that differ; close ones come near.
+    near = place_poles(a.T, (c @ a).T, pole + np.array([-1e-4, 0.0, 1e-4])).gain_matrix[0]
+    np.testing.assert_allclose(regression["gain"], near, rtol=1e-3)
+
+
+@pytest.mark.parametrize("mass", [1e-4, 4e-4, 3.6e-3])
+def test_blow_tells_the_mass(mass: float) -> None:
+    torques = np.zeros(60)
+    torques[40:43] = max(0.4, 400.0 * mass)
+    found, deviation = play(mass, torques, np.zeros(60))
+    assert found == pytest.approx(1.0 / mass, rel=0.1)
+    assert deviation < 0.3 * found
+
+
+def test_torque_that_answers_a_hand_tells_nothing() -> None:
+    """A wall that gives way to none would look heavy."""
+    push = -3.0 * PERIOD * np.arange(100)
+    found, deviation = play(4e-4, -push, push)
+    assert found == pytest.approx(1.0 / LIGHTEST)
+    assert deviation > 0.5 * found
+
+
+def test_latch_of_the_position_is_noise() -> None:
+    """A drive that samples up to 0.4 ms late makes the mass less certain, not another one."""
+    torques = np.zeros(160)
+    torques[140:143] = 0.2
+    steady, deviation = play(4e-4, torques, np.zeros(160))
+    jittered, larger = play(4e-4, torques, np.zeros(160), jitter=0.0004)
+    assert larger > 3.0 * deviation
+    assert abs(jittered - steady) < 3.0 * larger
+
+
+def test_another_hand_is_another_mass() -> None:
+    regression, estimator = made(), np.zeros(1, ESTIMATOR)
+    y, v = 0.0, -0.5
+    for j in range(200):
+        mass = 3.6e-3 if j < 100 else 2e-4
+        torque = 0.4 if j % 40 < 3 else 0.0
+        known = 1.0 / max(lightness(regression[0])[0], 200.0)
+        learn(regression[0], estimator[0], COUNT * round(y / COUNT), known)
+        predict_regression(regression[0], torque, torque)
+        estimator["in_flight"][0] = np.roll(estimator["in_flight"][0], 1)
+        estimator["in_flight"][0, 0] = torque
+        a = torque / mass
+        y, v = y + PERIOD * v + 0.5 * PERIOD**2 * a, v + PERIOD * a
+    assert lightness(regression[0])[0] == pytest.approx(1.0 / 2e-4, rel=0.1)
+
+
+def test_probe_is_shortly_before_a_contact_only() -> None:
+    regression, wall = made(), np.zeros(1, WALL)
+
+    def probed(y: float, v: float) -> float:
+        wall["y"], wall["v"] = y, v
+        return float(probe(regression[0], wall[0]))
+
+    assert probed(0.05, -0.5) == 0.0  # 100 ms away
+    assert probed(0.01, 0.5) == 0.0  # on its way out
+    assert probed(0.01, -0.05) == 0.0  # so slow that friction is not behind
+    torques = [probed(0.02 - 0.0005 * j, -0.5) for j in range(40)]
+    amplitude = 4.0 * COUNT * LIGHTEST / (2.0 * PERIOD) ** 2
+    np.testing.assert_allclose(np.abs(torques), amplitude)
+    # Four samples to and four fro: the lightest handle swings by four counts about its path.
+    assert np.sign(torques[:14]).tolist() == [1, 1] + 4 * [-1] + 4 * [1] + 4 * [-1]
+    v = np.cumsum(torques[:32]) * PERIOD / LIGHTEST
+    y = np.cumsum(v) * PERIOD
+    drift = np.polynomial.Polynomial.fit(np.arange(32), y, 1)(np.arange(32))
+    assert np.ptp(y - drift) == pytest.approx(4.0 * COUNT, rel=0.35)
