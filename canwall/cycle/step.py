@@ -142,8 +142,6 @@ def _force_of(cycle: Record, rendered: Record, due: bool) -> float:
         # A law that does not return is named by what looks at this cycle from beside it.
         cycle.evaluated = rendered.law + 1
         rendered.force = wall_force(cycle.laws[rendered.law], rendered.wall[0])
-        if cycle.bank[0].adapts:
-            rendered.force = with_probe(cycle.bank[0], rendered.wall[0], rendered.force)
         cycle.evaluated = 0
     return cycle.guard[0].factor * rendered.force
 
@@ -212,6 +210,8 @@ def _force_with_tpdo(cycle: Record, due: bool) -> float:
     if not math.isfinite(force):
         cycle.trip = _NAN
         return 0.0
+    if cycle.bank[0].adapts:
+        force = with_probe(cycle.bank[0], cycle.rendered[0].wall[0], force)
     return force
 
 
