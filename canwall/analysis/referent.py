@@ -1,5 +1,11 @@
-"""Continuous referent of a run: the same hand on the same handle, against an ideal wall."""
+"""Continuous referent of a run: the same hand on the same handle, against an ideal wall.
 
+The wall is the one that was asked for. Its damping may be given by a damping ratio; it then belongs
+to the mass that really moves, whatever a law takes it for. What a law makes of the wall instead, a
+stiffness that is capped or a damping for another mass, shows as a difference from the referent.
+"""
+
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -43,23 +49,48 @@ class ReferentInputs(NamedTuple):
 
 
 @compiled
+def referent_damping(stiffness: float, damping: float, damping_ratio: float, mass: float) -> float:
+    """Return B of the referent: 2·ζ·√(K·m) if there is a damping ratio ζ, else the one given.
+
+    Args:
+        stiffness: K asked for [N·m/rad].
+        damping: B asked for [N·m·s/rad].
+        damping_ratio: ζ, 0: none.
+        mass: m, inertia of everything that moves [kg·m²].
+    """
+    if damping_ratio > 0.0:
+        return 2.0 * damping_ratio * math.sqrt(stiffness * mass)
+    return damping
+
+
+@compiled
 def follow_referent(
-    inputs: ReferentInputs, stiffness: Array, damping: Array, y: Array, felt: Array
+    inputs: ReferentInputs,
+    stiffness: Array,
+    damping: Array,
+    damping_ratio: Array,
+    y: Array,
+    felt: Array,
 ) -> None:
     """Follow the continuous referent from SYNC to SYNC.
 
     Args:
         inputs: Hand and handle.
-        stiffness: Stiffness of the wall in each cycle [N·m/rad], shape (n,).
-        damping: Damping of the wall in each cycle [N·m·s/rad], shape (n,).
+        stiffness: Stiffness asked for in each cycle [N·m/rad], shape (n,).
+        damping: Damping asked for in each cycle [N·m·s/rad], shape (n,).
+        damping_ratio: Damping ratio in each cycle, shape (n,); 0: the damping is as given.
         y: Result: positions at each SYNC, relative to the wall [rad], shape (n,).
         felt: Result: mean force on the hand over the period from each SYNC on [N·m], shape (n,).
     """
     y[0] = inputs.rest - inputs.origin[0]
+    mass = inputs.joined[0].mass
+    aimed_at = np.empty(len(y))
+    for j in range(len(y)):
+        aimed_at[j] = referent_damping(stiffness[j], damping[j], damping_ratio[j], mass)
     if inputs.grip:
-        _follow_joined(inputs, stiffness, damping, y, felt)
+        _follow_joined(inputs, stiffness, aimed_at, y, felt)
     else:
-        _follow_grasp(inputs, stiffness, damping, y, felt)
+        _follow_grasp(inputs, stiffness, aimed_at, y, felt)
     felt[-1] = felt[-2] if len(felt) > 1 else 0.0
 
 

@@ -28,17 +28,22 @@ class ReferentMotion(NamedTuple):
 
 
 def referent_motion(
-    settings: Settings, stiffness: Array, damping: Array, wall_position: Array
+    settings: Settings,
+    stiffness: Array,
+    damping: Array,
+    damping_ratio: Array,
+    wall_position: Array,
 ) -> ReferentMotion | None:
     """Return the motion of the continuous referent of a run.
 
     The referent is the same hand with the same script on the same handle, against the continuous
-    wall of each cycle.
+    wall that is asked for in each cycle.
 
     Args:
         settings: Configuration of the run.
-        stiffness: Stiffness of the wall in each cycle [N·m/rad], shape (n,).
+        stiffness: Stiffness asked for in each cycle [N·m/rad], shape (n,).
         damping: Damping of the wall in each cycle [N·m·s/rad], shape (n,).
+        damping_ratio: Damping ratio asked for in each cycle, shape (n,); 0: none.
         wall_position: Position of the wall in each cycle [rad], shape (n,).
 
     Returns:
@@ -47,7 +52,7 @@ def referent_motion(
     if settings.simulation is None:
         return None
     return Referent(settings, settings.simulation, len(stiffness)).motion(
-        stiffness, damping, wall_position
+        stiffness, damping, damping_ratio, wall_position
     )
 
 
@@ -66,10 +71,12 @@ class Referent:
         self._body = body._replace(side=self._side * body.side)
         self._felt = felt_body(self._body, simulation.handle_inertia_kg_m2)
 
-    def motion(self, stiffness: Array, damping: Array, wall_position: Array) -> ReferentMotion:
+    def motion(
+        self, stiffness: Array, damping: Array, damping_ratio: Array, wall_position: Array
+    ) -> ReferentMotion:
         """Return the same as `referent_motion`."""
         motion = ReferentMotion(np.empty(len(stiffness)), np.empty(len(stiffness)))
-        follow_referent(self.inputs(wall_position), stiffness, damping, *motion)
+        follow_referent(self.inputs(wall_position), stiffness, damping, damping_ratio, *motion)
         return motion
 
     def inputs(self, wall_position: Array) -> ReferentInputs:

@@ -96,7 +96,8 @@ def write_result(
 
 def judged(signals: "pa.Table", settings: Settings, units: DriveUnits) -> dict[str, Any]:
     """Return what the summary has from the rows, judged against the continuous referent."""
-    wall = (numbers(signals, name) for name in ("stiffness", "damping", "wall_position_rad"))
+    asked = ("stiffness", "damping", "damping_ratio", "wall_position_rad")
+    wall = (numbers(signals, name) for name in asked)
     referent = referent_motion(settings, *wall)
     return summarise(signals, settings, units, *((None, None) if referent is None else referent))
 

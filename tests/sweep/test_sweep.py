@@ -141,16 +141,34 @@ def test_a_buzz_within_six_counts_is_felt() -> None:
     assert 200.0 < buzzing["frequency"] < 350.0
 
 
+def test_referent_has_the_damping_ratio_and_the_stiffness_that_were_asked_for() -> None:
+    """A cap and a wrong mass in the model are no excuse: they show in stiffness_in_force."""
+    mass, asked = 1e-4 + 0.05 * 0.08**2, 600.0
+    struck: dict[str, object] = {"operator": ["grip"], "stiffness": [asked], "law": ["mean_force"]}
+    wall = {"wall.damping_ratio": [0.5], "wall.cap": [0.5]}
+    capped = compute_piece(plan_of(**struck, **wall, model=["drive"]), 0)[0, 0]
+    plain = compute_piece(plan_of(**struck, damping=[np.sqrt(asked * mass)]), 0)[0, 0]
+    for name in ("referent_first_depth", "referent_ripple", "referent_motion"):
+        assert capped[name] == pytest.approx(plain[name], rel=1e-9), name
+    # Half of m/T² of a model that knows the drive alone.
+    assert capped["mass_est"] == pytest.approx(1e-4)
+    assert capped["stiffness_in_force"] == capped["stiffness_in_force_least"]
+    assert capped["stiffness_in_force"] == pytest.approx(50.0)
+    assert plain["stiffness_in_force"] == asked
+
+
 @pytest.mark.parametrize(
     ("axis", "values"),
     [
         ("simulation.current_bandwidth_hz", [800.0, 1600.0]),
         ("simulation.viscous_nm_s_per_rad", [1e-4, 1e-3]),
+        ("friction", [0.0, 0.02]),
+        ("servo", ["1600Hz", "800Hz"]),
         ("press_torque", [0.1, 0.2]),
         ("sync_jitter", [0.0, 1e-4]),
     ],
 )
-def test_numbers_of_plant_and_strike_are_axes(axis: str, values: list[float]) -> None:
+def test_numbers_of_plant_and_strike_are_axes(axis: str, values: list[object]) -> None:
     plan = plan_of(stiffness=[20.0], **{axis: values})
     one, other = (compute_piece(plan, piece)[0, 0] for piece in range(2))
     assert one["penetration"] != other["penetration"]
@@ -433,7 +451,7 @@ def test_a_worker_that_dies_is_one_line(tmp_path: Path) -> None:
         ({"stiffness": "1:2:0"}, "is not a range; write LO:HI:N"),
         ({"stiffness": "1,1"}, "axis stiffness: has a value twice"),
         ({"stiffness": ""}, "axis stiffness: has no values"),
-        ({"operator": "giant"}, "has to be one of none, finger, grip, hand, not 'giant'"),
+        ({"operator": "giant"}, "has to be one of none, fingertip, finger, grip, hand, arm, not"),
         ({"model": "none"}, "has to be one of matched, drive, file, not 'none'"),
         ({"rate": "0"}, "axis rate: has to be greater than 0"),
         ({"simulation.coulomb": "1"}, "simulation.coulomb: unknown key; did you mean"),
@@ -442,6 +460,8 @@ def test_a_worker_that_dies_is_one_line(tmp_path: Path) -> None:
         ({"nothing.at_all": "1"}, "nothing.at_all: there is no"),
         ({"law": "none"}, "wall.law: unknown law 'none'"),
         ({"wall.stiffness_nm_per_rad": "1"}, "use stiffness instead"),
+        ({"delay_error": "-1.5"}, "axis delay_error: -1.5 makes D = -0.5; it has to be between"),
+        ({"friction": "-0.01"}, "axis friction: has to be at least 0"),
         ({"delay": "3.5"}, "axis delay: has to be at most 3"),
         ({"damping": "-1"}, "axis damping: has to be at least 0, not -1"),
         ({"rate": "1e8"}, "a strike of .* cycles; 2000000 at most"),
@@ -562,6 +582,10 @@ def test_a_map_is_shown_in_a_table() -> None:
             "energy_out": (
                 ("law", "damping", "stiffness", "speed", "phase"),
                 np.zeros((2, 2, 3, 1, 1)),
+            ),
+            "stiffness_in_force": (
+                ("law", "damping", "stiffness", "speed", "phase"),
+                np.tile(np.array([[[1.0]], [[2.0]], [[3.0]]]), (2, 2, 1, 1, 1)),
             ),
         },
         {"law": ["a", "b"], "damping": [0.0, 1.0], "stiffness": [1.0, 2.0, 3.0]},
