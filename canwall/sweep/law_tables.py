@@ -33,8 +33,10 @@ _WITH_STIFFNESS = tuple(name for name in LAWS if name != "rigid")
 FRICTIONS = (0.0, 0.02)
 DELAY_ERRORS = (-0.3, 0.0, 0.15)
 _FRICTION = 0.01
-#: Strikes: mean speeds of approach [rad/s] and phases against the SYNC.
-_SPEEDS, _PHASES = (0.3, 1.0, 3.0), (0.0, 0.35, 0.7)
+#: Strikes: mean speeds of approach [rad/s], which are up to 1.5 times as high at the wall, phases
+#: against the SYNC, and time of the press [s], in which slow estimates of force settle as well.
+_SPEEDS, _PHASES = (0.3, 0.8, 2.0), (0.0, 0.35, 0.7)
+_PRESS_S = 1.2
 #: With the cap: c, and the walls that are asked for [N·m/rad].
 CAPS = (0.5, 1.0)
 _ASKED = tuple(np.geomspace(30.0, 5000.0, 12).round(1).tolist())
@@ -139,6 +141,7 @@ def _make_plans(
         "model": ["drive"],
         "speed": _SPEEDS,
         "phase": _PHASES,
+        "press": [_PRESS_S],
         **table.axes,
     }
     if not table.capped:
@@ -168,7 +171,7 @@ def _make_plans(
 def _limits_of(dataset: xr.Dataset, table: LawTable) -> xr.Dataset:
     """Return the K-limits at the best damping, over all axes of the table."""
     limits = dataset[list(_LIMITS)].assign(open_ended=dataset["open_ended"].all(STRIKES))
-    limits = limits.drop_vars([*STRIKES], errors="ignore").squeeze("model", drop=True)
+    limits = limits.drop_vars([*STRIKES], errors="ignore").squeeze(("model", "press"), drop=True)
     best = limits["worst_normalised"].argmax("damping_normalised")
     limits = limits.isel(damping_normalised=best)
     errors = table.axes.get("delay_error", ())
