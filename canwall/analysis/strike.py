@@ -73,9 +73,9 @@ MEASURE_DESCRIPTIONS = {
     "energy_tolerance": ("J", "one encoder count times the peak torque"),
     "peak_torque": ("N*m", "largest torque commanded"),
     "penetration": ("rad", "deepest position inside the wall"),
-    "stiffness_in_force": ("N*m/rad", "K in force at the end of the last contact"),
+    "stiffness_in_force": ("N*m/rad", "K in force towards the end of the longest contact"),
     "stiffness_in_force_least": ("N*m/rad", "least K in force during a contact"),
-    "mass_est": ("kg*m^2", "mass in the laws' model at the end of the last contact"),
+    "mass_est": ("kg*m^2", "mass in the laws' model at the same time"),
     "first_depth": ("rad", "deepest position of the first contact"),
     "referent_first_depth": ("rad", "the same of the continuous referent"),
     "rate_hardness": ("N*m/rad", "initial rise of the force over the approach speed"),
@@ -159,7 +159,8 @@ def measure_strike(
             _, into.frequency = metrics.limit_cycle(felt[start:stop], period)
     into.stiffness_in_force = into.stiffness_in_force_least = into.mass_est = math.nan
     if contacts:
-        into.stiffness_in_force, into.mass_est = in_force[0, after - 1], in_force[1, after - 1]
+        pressed = pressed_cycle(y, force)
+        into.stiffness_in_force, into.mass_est = in_force[0, pressed], in_force[1, pressed]
         into.stiffness_in_force_least = least_in_contact(y, force, in_force[0])
     into.penetration = max(-y.min(), 0.0) if len(y) else 0.0
     into.first_depth = first_depth(y)
@@ -187,6 +188,22 @@ def _count_contacts(y: Array, force: Array) -> tuple[int, int, int]:
         touching = touches
         after = j + 1 if touches else after
     return first, after, contacts
+
+
+@compiled
+def pressed_cycle(y: Array, force: Array) -> int:
+    """Return the cycle in which a wall is known best: the last of `judged_part`, longest contact.
+
+    There the hand presses, and is not yet leaving. Contact is defined as in `metrics.contacts`.
+    """
+    start = best_start = best_stop = 0
+    for j in range(len(y)):
+        if not (y[j] < 0.0 or force[j] != 0.0):
+            start = j + 1
+        elif j + 1 - start > best_stop - best_start:
+            best_start, best_stop = start, j + 1
+    _, last = metrics.judged_part(best_start, best_stop)
+    return max(last - 1, best_start)
 
 
 @compiled

@@ -152,6 +152,7 @@ def draw_in_force(axes: Axes, signals: "pa.Table") -> Axes:
     axes.plot(t, asked, color=COLOURS[2], lw=0.8, ls="--", label="K asked")
     axes.plot(t, in_force, color=COLOURS[2], lw=1.2, label="K in force")
     axes.set_ylim(bottom=0.0)
+    axes.set_title("Mass and stiffness in force")
     axes.set_ylabel("K [N·m/rad]")
     axes.set_xlabel("time [s]")
     mass = axes.twinx()
@@ -161,7 +162,9 @@ def draw_in_force(axes: Axes, signals: "pa.Table") -> Axes:
     mass.grid(visible=False)
     mass.spines["right"].set_visible(True)
     handles = [*axes.get_lines(), *mass.get_lines()]
-    mass.legend(handles, [str(line.get_label()) for line in handles], loc="upper right", ncols=3)
+    labels = [str(line.get_label()) for line in handles]
+    # Above the axes: at the wall's stiffness there are lines all along.
+    mass.legend(handles, labels, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3)
     return mass
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from canwall.analysis import metrics
 from canwall.analysis.felt import HANDLE_RADIUS_M, band_rms, felt_band
-from canwall.analysis.strike import SPAN, first_bounce, first_depth
+from canwall.analysis.strike import SPAN, first_bounce, first_depth, least_in_contact, pressed_cycle
 from canwall.config import Settings
 from canwall.record.columns import Phase
 from canwall.record.folder import numbers
@@ -48,7 +48,7 @@ def summarise(
     touched = metrics.contacts(np.where(rendering, y, np.inf), force)
     strikes = [
         _strike(strike, y, force, work, stiffness, laws, settings, units, referent, referent_felt)
-        | _in_force(strike, signals)
+        | _in_force(strike, y, force, signals)
         for strike in metrics.strikes(touched, settings.bus.cycle_s, _changes(signals))
     ]
     chattering = [s for s in strikes if s["chatter"]]
@@ -145,13 +145,17 @@ def _strike(
     }
 
 
-def _in_force(strike: metrics.StrikeContacts, signals: "pa.Table") -> dict[str, Any]:
+def _in_force(
+    strike: metrics.StrikeContacts, y: Array, force: Array, signals: "pa.Table"
+) -> dict[str, Any]:
     """Return what the cycle made of the wall that was asked for, and of the operator."""
     stiffness = numbers(signals, "stiffness_in_force")
-    last = strike.contacts[-1].stop - 1
+    last = strike.cycles.start + pressed_cycle(y[strike.cycles], force[strike.cycles])
     return {
         "stiffness_in_force": float(stiffness[last]),
-        "stiffness_in_force_least": min(float(stiffness[c].min()) for c in strike.contacts),
+        "stiffness_in_force_least": least_in_contact(
+            y[strike.cycles], force[strike.cycles], stiffness[strike.cycles]
+        ),
         "mass_est_kg_m2": float(numbers(signals, "mass_est")[last]),
         "mass_spread": float(numbers(signals, "mass_spread")[last]),
     }

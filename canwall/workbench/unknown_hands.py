@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 _STIFFNESS, _SPEED = 300.0, 0.7
 #: Cycles before the contact and after it.
 _BEFORE, _AFTER = 20, 140
+#: Positions that are shown [mrad].
+_SHOWN = (-9.0, 9.0)
 _POSITION, _IN_FORCE, _MASS = COLOURS[5], COLOURS[0], COLOURS[2]
 
 
@@ -126,6 +128,7 @@ def _draw_strike(
     above.plot(t, strike.y * 1e3, color=_POSITION, lw=1.4, label="position")
     above.plot(t, strike.referent * 1e3, "--", color=REFERENT, lw=1.0, label="wall as asked")
     above.axhline(0.0, color="k", lw=0.8)
+    above.set_ylim(*_SHOWN)
     above.set_title(f"{name}, {1e3 * strike.true_mass:.3g} g·m² with the handle")
     above.set_ylabel("y [mrad]")
     above.tick_params(labelbottom=False)
