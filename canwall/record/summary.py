@@ -74,7 +74,7 @@ def summarise(
 def _changes(signals: "pa.Table") -> Array:
     """Return the cycles at which law, stiffness, damping or position of the wall change."""
     columns = [np.from_dlpack(signals["law"].combine_chunks().indices)]
-    asked = ("stiffness", "damping_ratio", "wall_position_rad")
+    asked = ("stiffness", "damping_ratio", "cap", "wall_position_rad")
     columns += [numbers(signals, name) for name in asked]
     # The damping that belongs to a damping ratio follows the mass in force.
     columns.append(np.where(columns[2] > 0.0, 0.0, numbers(signals, "damping")))

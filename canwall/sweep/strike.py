@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from canwall.analysis import ReferentInputs, follow_referent
+from canwall.analysis import AskedWall, ReferentInputs, follow_referent
 from canwall.analysis.felt import HANDLE_RADIUS_M, FeltBand, felt_band
 from canwall.analysis.strike import MEASURES, measure_strike
 from canwall.compiled import Record, compiled
@@ -234,7 +234,14 @@ class PreparedStrike:
         ).records()
         referent = Referent(settings, settings.simulation, self._cycles)
         self._referent = referent.inputs(np.full(self._cycles, settings.wall.position_rad))
-        self._damping_ratio = np.full(self._cycles, settings.wall.damping_ratio or 0.0)
+        # Each wall fills in its own stiffness and damping.
+        wall = settings.wall
+        self._asked = AskedWall(
+            *(
+                np.full(self._cycles, value or 0.0)
+                for value in (None, None, wall.damping_ratio, wall.cap)
+            )
+        )
         self._band = felt_band(settings.bus.cycle_s)
         self._radius = settings.mechanics.handle_radius_m or HANDLE_RADIUS_M
         self._by_frames = through == "bus"
@@ -283,7 +290,7 @@ class PreparedStrike:
             _strike_all(
                 self._loop,
                 self._referent,
-                self._damping_ratio,
+                AskedWall(*(values.copy() for values in self._asked)),
                 self._band,
                 self._radius,
                 walls,
@@ -299,8 +306,10 @@ class PreparedStrike:
         )
         felt = self._felt_under(signals[2], stiffness, damping)
         referent, referent_felt = np.empty(self._cycles), np.empty(self._cycles)
-        each = np.full(self._cycles, stiffness), np.full(self._cycles, damping)
-        follow_referent(self._referent, *each, self._damping_ratio, referent, referent_felt)
+        asked = self._asked._replace(
+            stiffness=np.full(self._cycles, stiffness), damping=np.full(self._cycles, damping)
+        )
+        follow_referent(self._referent, asked, referent, referent_felt)
         measures = np.zeros(1, MEASURES)
         _judge(
             self._loop,
@@ -335,23 +344,22 @@ class PreparedStrike:
 def _strike_all(
     loop: LoopRecords,
     hand: ReferentInputs,
-    damping_ratio: Array,
+    asked: AskedWall,
     band: FeltBand,
     radius: float,
     walls: Array,
     rows: NDArray[np.void],
     measures: NDArray[np.void],
 ) -> None:
-    """Strike and judge every wall; rows, shape (1,) and dtype ROW, is scratch memory."""
+    """Strike and judge every wall; rows, shape (1,) and dtype ROW, and asked are scratch memory."""
     cycles = len(loop.push)
     signals = np.empty((SIGNALS, cycles))
-    stiffness, damping = np.empty(cycles), np.empty(cycles)
     referent, referent_felt = np.empty(cycles), np.empty(cycles)
     for i in range(len(walls)):
-        stiffness[:], damping[:] = walls[i, 0], walls[i, 1]
+        asked.stiffness[:], asked.damping[:] = walls[i, 0], walls[i, 1]
         done = simulate_wall(loop, walls[i, 0], walls[i, 1], rows, signals)
         cycle: Record = loop.cycle[0]
-        follow_referent(hand, stiffness, damping, damping_ratio, referent, referent_felt)
+        follow_referent(hand, asked, referent, referent_felt)
         _judge(
             loop,
             band,

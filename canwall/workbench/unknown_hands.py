@@ -9,6 +9,7 @@ from matplotlib.gridspec import SubplotSpec
 from numpy.typing import NDArray
 
 from canwall import config
+from canwall.analysis import AskedWall
 from canwall.config import Settings
 from canwall.figure_style import COLOURS
 from canwall.record import Phase
@@ -34,7 +35,7 @@ class OperatorStrike(NamedTuple):
 
     Attributes:
         y: Position relative to the wall [rad].
-        referent: That of the continuous wall as it was asked for [rad].
+        referent: That of the continuous wall, as stiff as the mass allows [rad].
         stiffness: Stiffness in force [N·m/rad].
         mass: Mass in the laws' model [kg·m²].
         true_mass: Inertia of drive, handle and hand [kg·m²].
@@ -54,10 +55,8 @@ def strike_by(operator: str) -> OperatorStrike:
     assert settings.simulation is not None
     cycles = round(settings.run.duration_s / settings.bus.cycle_s)
     rows = simulate(settings, cycles).rows
-    referent = referent_motion(
-        settings,
-        *(rows[name] for name in ("stiffness", "damping", "damping_ratio", "wall_position_rad")),
-    )
+    asked = AskedWall(*(rows[name].copy() for name in AskedWall._fields))
+    referent = referent_motion(settings, asked, rows["wall_position_rad"])
     assert referent is not None
     contact = np.flatnonzero((rows["phase"] == Phase.RENDERING) & (rows["y"] < 0.0))[0]
     shown = slice(contact - _BEFORE, contact + _AFTER)
@@ -126,7 +125,7 @@ def _draw_strike(
     above = figure.add_subplot(rows[0])
     below = figure.add_subplot(rows[1], sharex=above)
     above.plot(t, strike.y * 1e3, color=_POSITION, lw=1.4, label="position")
-    above.plot(t, strike.referent * 1e3, "--", color=REFERENT, lw=1.0, label="wall as asked")
+    above.plot(t, strike.referent * 1e3, "--", color=REFERENT, lw=1.0, label="continuous wall")
     above.axhline(0.0, color="k", lw=0.8)
     above.set_ylim(*_SHOWN)
     above.set_title(f"{name}, {1e3 * strike.true_mass:.3g} g·m² with the handle")

@@ -7,6 +7,7 @@ import pytest
 from rig import settings_with
 from scipy.integrate import solve_ivp
 
+from canwall.analysis import AskedWall
 from canwall.config import Settings, with_overrides
 from canwall.run.referent import referent_motion
 from canwall.simdrive import ServoMotion
@@ -22,7 +23,7 @@ def test_without_a_wall_it_moves_as_the_handle_does(grip: bool, side: str) -> No
     settings: Settings = base.model_copy(update={"simulation": simulation})
     nothing, position = np.zeros(1500), np.full(1500, 0.013)
     position[700:] = -0.02  # the wall is moved, the handle is not
-    referent = referent_motion(settings, nothing, nothing, nothing, position)
+    referent = referent_motion(settings, AskedWall(*[nothing] * 4), position)
     assert referent is not None
     motion = ServoMotion(simulation, settings.bus.cycle_s, 2.0 * math.pi * 1e6)
     seen, parted = [], False
@@ -36,9 +37,9 @@ def test_without_a_wall_it_moves_as_the_handle_does(grip: bool, side: str) -> No
     assert parted is not grip
 
 
-def test_damping_ratio_is_that_of_the_mass_that_moves() -> None:
-    """With ζ the wall is max(0, −K·y − 2·ζ·√(K·m)·ẏ), m of drive and hand, whatever B says."""
-    stiffness, ratio, press = 100.0, 0.5, -0.2
+def test_damping_and_cap_are_those_of_the_mass_that_moves() -> None:
+    """The wall is max(0, −K·y − 2·ζ·√(K·m)·ẏ), K = c·m/T², m of drive and hand, whatever B says."""
+    asked, ratio, press = 5000.0, 0.5, -0.2
     hand = {
         "simulation.hand.strikes": 1,
         "simulation.hand.first_strike_s": 0.0,
@@ -54,11 +55,14 @@ def test_damping_ratio_is_that_of_the_mass_that_moves() -> None:
     settings = base.model_copy(update={"schedule": ()})
     n, period = 120, settings.bus.cycle_s
     each = np.ones(n)
-    found = referent_motion(settings, stiffness * each, 7.0 * each, ratio * each, 0.0 * each)
+    cap = 0.6
+    wall = AskedWall(asked * each, 7.0 * each, ratio * each, cap * each)
+    found = referent_motion(settings, wall, 0.0 * each)
     assert found is not None
     simulation = base.simulation
     mass = simulation.inertia_kg_m2 + simulation.hand.inertia_kg_m2
     viscous = simulation.viscous_nm_s_per_rad + simulation.hand.damping_nm_s_per_rad
+    stiffness = cap * mass / period**2
     damping = 2.0 * ratio * math.sqrt(stiffness * mass)
 
     def push(t: float) -> float:

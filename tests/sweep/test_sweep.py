@@ -141,20 +141,23 @@ def test_a_buzz_within_six_counts_is_felt() -> None:
     assert 200.0 < buzzing["frequency"] < 350.0
 
 
-def test_referent_has_the_damping_ratio_and_the_stiffness_that_were_asked_for() -> None:
-    """A cap and a wrong mass in the model are no excuse: they show in stiffness_in_force."""
+def test_referent_is_the_wall_in_force_for_the_mass_that_moves() -> None:
+    """A wrong mass in the model is no excuse: it shows in mass_est and stiffness_in_force."""
     mass, asked = 1e-4 + 0.05 * 0.08**2, 600.0
-    struck: dict[str, object] = {"operator": ["grip"], "stiffness": [asked], "law": ["mean_force"]}
+    struck: dict[str, object] = {"operator": ["grip"], "law": ["mean_force"]}
     wall = {"wall.damping_ratio": [0.5], "wall.cap": [0.5]}
-    capped = compute_piece(plan_of(**struck, **wall, model=["drive"]), 0)[0, 0]
-    plain = compute_piece(plan_of(**struck, damping=[np.sqrt(asked * mass)]), 0)[0, 0]
-    for name in ("referent_first_depth", "referent_ripple", "referent_motion"):
-        assert capped[name] == pytest.approx(plain[name], rel=1e-9), name
+    capped = plan_of(**struck, **wall, stiffness=[asked], model=["drive"])
+    found = compute_piece(capped, 0)[0, 0]
+    stiffness = 0.5 * mass / 1e-6
+    plain = plan_of(**struck, stiffness=[stiffness], damping=[np.sqrt(stiffness * mass)])
+    referent = compute_piece(plain, 0)[0, 0]
+    for name in ("referent_first_depth", "referent_ripple", "referent_events"):
+        assert found[name] == pytest.approx(referent[name], rel=1e-9), name
     # Half of m/T² of a model that knows the drive alone.
-    assert capped["mass_est"] == pytest.approx(1e-4)
-    assert capped["stiffness_in_force"] == capped["stiffness_in_force_least"]
-    assert capped["stiffness_in_force"] == pytest.approx(50.0)
-    assert plain["stiffness_in_force"] == asked
+    assert found["mass_est"] == pytest.approx(1e-4)
+    assert found["stiffness_in_force"] == found["stiffness_in_force_least"]
+    assert found["stiffness_in_force"] == pytest.approx(50.0)
+    assert referent["stiffness_in_force"] == pytest.approx(stiffness)
 
 
 @pytest.mark.parametrize(
