@@ -268,20 +268,23 @@ def _write_laws(dataset: xr.Dataset) -> Iterator[str]:
 
 
 def _write_cap(dataset: xr.Dataset) -> Iterator[str]:
-    """Yield failed strikes, and stiffness in force over min(K, m/T²), for each cap."""
+    """Yield failed strikes by criterion, and stiffness in force over min(K, m/T²), for each cap."""
     operators = _names(dataset, "operator")
     most = np.minimum(dataset["stiffness"], dataset["inertia"] / dataset["period"] ** 2)
     share = dataset["stiffness_in_force"] / most
-    failed = dataset["chatters"]
     yield from _head(operators)
     for law in _names(dataset, "law"):
         for cap in dataset["wall.cap"].values.tolist():
             some = {"law": law, "wall.cap": cap}
-            cells = []
-            for operator in operators:
-                these = failed.sel(some).sel(operator=operator)
-                cells.append(f"{int(these.sum())} of {these.size}")
-            yield _row(f"{law}, cap {cap:g}: failed strikes", cells)
+            for criterion, name in (
+                ("chatters", f"{law}, cap {cap:g}: failed strikes"),
+                ("chatters_ripple", "with a felt ripple"),
+                ("chatters_amplitude", "with motion about the settled contact"),
+                ("chatters_counts", "with more makes and breaks"),
+            ):
+                of_kind = dataset[criterion].sel(some)
+                each = [of_kind.sel(operator=operator) for operator in operators]
+                yield _row(name, [f"{int(these.sum())} of {these.size}" for these in each])
             for description, quantile in (("least", 0.0), ("median", 0.5)):
                 values = [
                     float(np.nanquantile(share.sel(some).sel(operator=o), quantile))

@@ -43,7 +43,7 @@ def raw(plan: Plan) -> list[bytes]:
 @pytest.mark.parametrize(
     "axes",
     [
-        {"law": ["standard", "mean_force"], "operator": ["none", "finger", "hand"]},
+        {"law": ["standard", "mean_force"], "operator": ["none", "finger", "arm"]},
         {"rate": [100, 550, 1000], "law": "mean_force"},
         {"delay": [0, 0.5, 1, 1.6, 2], "law": "half_sample"},
         {"counts": [4096, 1 << 20]},
@@ -191,7 +191,7 @@ def stop_after(count: int) -> Any:
 
 @pytest.mark.slow
 def test_an_interrupted_sweep_goes_on(tmp_path: Path) -> None:
-    plan = plan_of(stiffness="1:100:40", operator=["none", "finger", "grip", "hand"])
+    plan = plan_of(stiffness="1:100:40", operator=["none", "finger", "grip", "arm"])
     whole = sweep(plan, tmp_path / "whole.nc")
     output = tmp_path / "parts.nc"
     with pytest.raises(StoppedError):
@@ -199,7 +199,7 @@ def test_an_interrupted_sweep_goes_on(tmp_path: Path) -> None:
     assert not output.exists()
     with pytest.raises(InputError, match="holds an unfinished sweep; --resume continues"):
         sweep(plan, output)
-    other = plan_of(stiffness="1:100:41", operator=["none", "finger", "grip", "hand"])
+    other = plan_of(stiffness="1:100:41", operator=["none", "finger", "grip", "arm"])
     with pytest.raises(InputError, match="another configuration or other axes"):
         sweep(other, output, resume=True)
     said: list[int] = []
