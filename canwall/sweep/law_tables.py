@@ -259,12 +259,13 @@ def _write_laws(dataset: xr.Dataset) -> Iterator[str]:
         yield ""
         yield f"Delay of the model off by {error:+g} T, K·T²/m, the worst of all frictions:"
         yield ""
-        servos = _names(dataset, "servo")
-        yield from _head([f"{o}, {_servo_name(s)}" for s in servos for o in operators])
+        yield from _head(operators)
         off = normalised.sel(delay_error=error).min("friction")
         for law in of_model:
-            found = [off.sel(law=law, servo=s, operator=o) for s in servos for o in operators]
-            yield _row(law, [_number(value.item()) for value in found])
+            for servo in _names(dataset, "servo"):
+                found = [off.sel(law=law, servo=servo, operator=o) for o in operators]
+                cells = [_number(value.item()) for value in found]
+                yield _row(f"{law}, {_servo_name(servo)}", cells)
 
 
 def _write_cap(dataset: xr.Dataset) -> Iterator[str]:

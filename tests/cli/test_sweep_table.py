@@ -64,7 +64,7 @@ def test_k_limits_are_those_of_a_sweep(tmp_path: Path, capsys: pytest.CaptureFix
     assert float(worst[3][1].partition("*; ")[0].strip("*")) == pytest.approx(
         written["worst_normalised"].sel(law="mean_force").min().item(), rel=5e-3
     )
-    assert [row[0] for row in off[1:]] == ["mean_force"]
+    assert [row[0] for row in off[1:]] == ["mean_force, 1600 Hz + 0.25 ms"]
     # The same walls, one by one, without a cap and with what each law may know.
     settings = config.load(SERVO)
     wall = settings.wall.model_copy(update={"cap": None})
