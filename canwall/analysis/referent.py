@@ -1,5 +1,12 @@
-"""Continuous referent of a run: the same hand on the same handle, against an ideal wall."""
+"""Continuous referent of a run: the same hand on the same handle, against an ideal wall.
 
+The wall is the one at which a law aims: what was asked for, as it would be in force if the mass
+were known. A stiffness may be capped, and a damping be given by a damping ratio; both belong to the
+mass that really moves. What a law makes of the wall that takes it for another one shows as a
+difference from the referent.
+"""
+
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -42,20 +49,58 @@ class ReferentInputs(NamedTuple):
     rest: float
 
 
+class AskedWall(NamedTuple):
+    """The wall that is asked for in each cycle; arrays of shape (n,).
+
+    Attributes:
+        stiffness: K [N·m/rad].
+        damping: B [N·m·s/rad].
+        damping_ratio: ζ of the damping, in place of B; 0: none.
+        cap: c of the largest stiffness c·m/T²; 0: none.
+    """
+
+    stiffness: Array
+    damping: Array
+    damping_ratio: Array
+    cap: Array
+
+
 @compiled
-def follow_referent(
-    inputs: ReferentInputs, stiffness: Array, damping: Array, y: Array, felt: Array
-) -> None:
+def wall_aimed_at(asked: AskedWall, j: int, mass: float, period: float) -> tuple[float, float]:
+    """Return stiffness and damping at which a law aims in cycle j.
+
+    K_e = min(K, c·m/T²) where there is a cap, and B = 2·ζ·√(K_e·m) where there is a damping ratio
+    (theory, section 8).
+
+    Args:
+        asked: The wall that is asked for.
+        j: Number of the cycle.
+        mass: m, inertia of everything that moves [kg·m²].
+        period: T [s].
+    """
+    stiffness, damping = asked.stiffness[j], asked.damping[j]
+    if asked.cap[j] > 0.0:
+        stiffness = min(stiffness, asked.cap[j] * mass / (period * period))
+    if asked.damping_ratio[j] > 0.0:
+        damping = 2.0 * asked.damping_ratio[j] * math.sqrt(stiffness * mass)
+    return stiffness, damping
+
+
+@compiled
+def follow_referent(inputs: ReferentInputs, asked: AskedWall, y: Array, felt: Array) -> None:
     """Follow the continuous referent from SYNC to SYNC.
 
     Args:
         inputs: Hand and handle.
-        stiffness: Stiffness of the wall in each cycle [N·m/rad], shape (n,).
-        damping: Damping of the wall in each cycle [N·m·s/rad], shape (n,).
+        asked: The wall that is asked for in each cycle.
         y: Result: positions at each SYNC, relative to the wall [rad], shape (n,).
         felt: Result: mean force on the hand over the period from each SYNC on [N·m], shape (n,).
     """
     y[0] = inputs.rest - inputs.origin[0]
+    mass = inputs.joined[0].mass
+    stiffness, damping = np.empty(len(y)), np.empty(len(y))
+    for j in range(len(y)):
+        stiffness[j], damping[j] = wall_aimed_at(asked, j, mass, inputs.period)
     if inputs.grip:
         _follow_joined(inputs, stiffness, damping, y, felt)
     else:

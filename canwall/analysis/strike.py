@@ -35,6 +35,9 @@ MEASURES = np.dtype(
         ("energy_tolerance", "f8"),
         ("peak_torque", "f8"),
         ("penetration", "f8"),
+        ("stiffness_in_force", "f8"),
+        ("stiffness_in_force_least", "f8"),
+        ("mass_est", "f8"),
         ("first_depth", "f8"),
         ("referent_first_depth", "f8"),
         ("rate_hardness", "f8"),
@@ -70,6 +73,9 @@ MEASURE_DESCRIPTIONS = {
     "energy_tolerance": ("J", "one encoder count times the peak torque"),
     "peak_torque": ("N*m", "largest torque commanded"),
     "penetration": ("rad", "deepest position inside the wall"),
+    "stiffness_in_force": ("N*m/rad", "K in force towards the end of the longest contact"),
+    "stiffness_in_force_least": ("N*m/rad", "least K in force during a contact"),
+    "mass_est": ("kg*m^2", "mass in the laws' model at the same time"),
     "first_depth": ("rad", "deepest position of the first contact"),
     "referent_first_depth": ("rad", "the same of the continuous referent"),
     "rate_hardness": ("N*m/rad", "initial rise of the force over the approach speed"),
@@ -89,6 +95,7 @@ def measure_strike(
     trip: int,
     thrown: bool,
     felt: Array,
+    in_force: Array,
     referent: Array,
     referent_felt: Array,
     period: float,
@@ -108,6 +115,7 @@ def measure_strike(
         trip: The limit that ended the strike, 0 for none.
         thrown: True if the wall threw the handle beyond limits that the referent keeps.
         felt: Mean forces on the hand over each period [N·m], shape (n,).
+        in_force: Stiffness in force [N·m/rad] and mass in the laws' model [kg·m²], shape (2, n).
         referent: Positions of the continuous referent [rad], shape (n,).
         referent_felt: Its mean forces on the hand [N·m], shape (n,).
         period: Period of the SYNC [s].
@@ -115,7 +123,7 @@ def measure_strike(
         radius: Radius of the handle [m].
         count: One encoder count Δ [rad].
         torque_step: One step of torque f_LSB [N·m].
-        stiffness: Stiffness of the wall [N·m/rad].
+        stiffness: Stiffness asked for [N·m/rad].
         measures: Result, shape (1,), dtype MEASURES.
     """
     into: Record = measures[0]
@@ -149,6 +157,11 @@ def measure_strike(
         into.amplitude, into.frequency = metrics.limit_cycle(cycle, period)
         if not moves:  # it may be felt within one count
             _, into.frequency = metrics.limit_cycle(felt[start:stop], period)
+    into.stiffness_in_force = into.stiffness_in_force_least = into.mass_est = math.nan
+    if contacts:
+        pressed = pressed_cycle(y, force)
+        into.stiffness_in_force, into.mass_est = in_force[0, pressed], in_force[1, pressed]
+        into.stiffness_in_force_least = least_in_contact(y, force, in_force[0])
     into.penetration = max(-y.min(), 0.0) if len(y) else 0.0
     into.first_depth = first_depth(y)
     into.referent_first_depth = first_depth(referent)
@@ -175,6 +188,32 @@ def _count_contacts(y: Array, force: Array) -> tuple[int, int, int]:
         touching = touches
         after = j + 1 if touches else after
     return first, after, contacts
+
+
+@compiled
+def pressed_cycle(y: Array, force: Array) -> int:
+    """Return the cycle in which a wall is known best: the last of `judged_part`, longest contact.
+
+    There the hand presses, and is not yet leaving. Contact is defined as in `metrics.contacts`.
+    """
+    start = best_start = best_stop = 0
+    for j in range(len(y)):
+        if not (y[j] < 0.0 or force[j] != 0.0):
+            start = j + 1
+        elif j + 1 - start > best_stop - best_start:
+            best_start, best_stop = start, j + 1
+    _, last = metrics.judged_part(best_start, best_stop)
+    return max(last - 1, best_start)
+
+
+@compiled
+def least_in_contact(y: Array, force: Array, values: Array) -> float:
+    """Return the least of the values during contact, as `metrics.contacts` defines it."""
+    least = math.inf
+    for j in range(len(y)):
+        if y[j] < 0.0 or force[j] != 0.0:
+            least = min(least, values[j])
+    return least
 
 
 @compiled

@@ -156,15 +156,21 @@ def drive(
 
 
 def _strike_table(strikes: list[dict[str, Any]]) -> Table:
-    # Ten columns in a terminal of 80 characters.
-    table = Table(title="Strikes", title_justify="left", box=box.SIMPLE, padding=0)
+    # At most eleven columns in a terminal of 80 characters.
+    finds = any(_is_found(strike) for strike in strikes)
+    table = Table(
+        title="Strikes", title_justify="left", box=box.SIMPLE, padding=0, show_edge=not finds
+    )
     table.add_column("#", justify="right")
     table.add_column("law", no_wrap=True)
-    table.add_column("K\n\\[N·m/rad]", justify="right")
-    table.add_column("contacts", justify="right")
-    table.add_column("deepest\n\\[mrad]", justify="right")
-    table.add_column("first ÷\nref.", justify="right")
-    table.add_column("energy\nout \\[mJ]", justify="right")
+    table.add_column("K asked" if finds else "K\n\\[N·m/rad]", justify="right")
+    if finds:
+        table.add_column("in\nforce", justify="right")
+        table.add_column("mass\n\\[g·m²]", justify="right")
+    table.add_column("con-\ntacts" if finds else "contacts", justify="right")
+    table.add_column("depth\n\\[mrad]" if finds else "deepest\n\\[mrad]", justify="right")
+    table.add_column("first\n÷ ref.", justify="right")
+    table.add_column("energy\n\\[mJ]" if finds else "energy\nout \\[mJ]", justify="right")
     table.add_column("ripple\n\\[N]", justify="right")
     table.add_column("chatter", no_wrap=True)
     for number, strike in enumerate(strikes, start=1):
@@ -175,6 +181,7 @@ def _strike_table(strikes: list[dict[str, Any]]) -> Table:
             str(number),
             strike["law"],
             f"{strike['stiffness']:g}",
+            *(_found(strike) if finds else ()),
             str(strike["contacts"]),
             f"{strike['peak_penetration_rad'] * 1e3:.2f}",
             _depth_ratio(strike),
@@ -183,6 +190,16 @@ def _strike_table(strikes: list[dict[str, Any]]) -> Table:
             chatter,
         )
     return table
+
+
+def _is_found(strike: dict[str, Any]) -> bool:
+    """Return True if the cycle has found the mass itself, or lowered the stiffness."""
+    asked: float = strike["stiffness"]
+    return strike["mass_spread"] > 0.0 or strike["stiffness_in_force_least"] < asked
+
+
+def _found(strike: dict[str, Any]) -> tuple[str, str]:
+    return f"{strike['stiffness_in_force']:.3g}", f"{1e3 * strike['mass_est_kg_m2']:.3g}"
 
 
 def _depth_ratio(strike: dict[str, Any]) -> str:

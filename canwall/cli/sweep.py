@@ -1,5 +1,6 @@
 """Commands for sweeps: `sweep`, and `plot`, which draws recorded runs and sweeps."""
 
+import os
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -27,15 +28,17 @@ def sweep(
     damping: Annotated[str | None, typer.Option(metavar="LO:HI:N", help="B [N·m·s/rad].")] = None,
     rate: Annotated[str | None, typer.Option(metavar="LO:HI:N", help="Rate [Hz].")] = None,
     operator: Annotated[
-        list[str] | None, typer.Option(help="none, finger, grip, hand; may be repeated.")
+        list[str] | None,
+        typer.Option(help="none, fingertip, finger, grip, hand, arm; may be repeated."),
     ] = None,
     axis: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME=VALUES",
             help="Any other axis: a key of the configuration, or delay, counts, torque_step, "
-            "model, model_error, servo, speed, phase, start, press, press_torque, sync_jitter, "
-            "stiffness_normalised, damping_normalised; VALUES: A,B,C or LO:HI:N.",
+            "model, model_error, delay_error, servo, friction, speed, phase, start, press, "
+            "press_torque, sync_jitter, stiffness_normalised, damping_normalised; "
+            "VALUES: A,B,C or LO:HI:N.",
         ),
     ] = None,
     through: Annotated[str, typer.Option(help="sim: in memory; bus: by frames.")] = "sim",
@@ -45,14 +48,14 @@ def sweep(
         bool, typer.Option("--resume", help="Continue a sweep that was interrupted.")
     ] = False,
     table: Annotated[
-        bool,
+        str | None,
         typer.Option(
-            "--table",
-            help="Print the K-limits of laws (--law; without: all) with operators (--operator; "
-            "without: all) as a Markdown table, instead of writing a file. Its other axes are "
-            "fixed; [sweep] of CONFIG is ignored.",
+            metavar="NAME",
+            help="Print a Markdown table: laws (K-limits), cap, first-strike, or shaft; for laws "
+            "(--law) and operators (--operator; without: all). Its other axes are fixed; [sweep] "
+            "of CONFIG is ignored. With --output, the result is written as well.",
         ),
-    ] = False,
+    ] = None,
 ) -> int:
     """Sweep strikes over any axes and judge each wall, or search the K-limit at each point."""
     if workers is not None and dask is not None:
@@ -60,9 +63,8 @@ def sweep(
     from canwall.config import absolute_law
 
     laws = [absolute_law(name, Path()) for name in law or []]
-    if table:
+    if table is not None:
         unused = {
-            "--output": output,
             "--stiffness": stiffness,
             "--damping": damping,
             "--rate": rate,
@@ -70,8 +72,8 @@ def sweep(
             "--resume": resume,
         }
         if given := ", ".join(option for option, value in unused.items() if value):
-            raise InputError(f"--table has fixed axes and writes no file: leave out {given}")
-        return _print_k_limit_table(config_file, laws, operator, through, workers, dask)
+            raise InputError(f"--table has fixed axes: leave out {given}")
+        return _print_law_table(config_file, table, output, laws, operator, through, workers, dask)
     if output is None:
         raise InputError("--output is missing: give the FILE.nc of the result")
     axes = _parse_axes(axis or [])
@@ -117,8 +119,10 @@ def _parse_axes(assignments: list[str]) -> dict[str, object]:
     return axes
 
 
-def _print_k_limit_table(
+def _print_law_table(
     config_file: Path | None,
+    table: str,
+    output: Path | None,
     laws: list[str],
     operators: list[str] | None,
     through: str,
@@ -126,15 +130,19 @@ def _print_k_limit_table(
     dask: str | None,
 ) -> int:
     settings = settings_from(config_file)
-    from canwall.sweep import OPERATORS, TABLE_LAWS, compute_k_limit_table, format_k_limit_table
+    from canwall.sweep import OPERATORS, compute_law_table, format_law_table, write_sweep
 
-    laws = laws or list(TABLE_LAWS)
+    if output is not None and os.path.lexists(output):
+        raise InputError(f"{output}: exists already; choose another --output")
     with ProgressDisplay() as display:
-        progress = partial(display.count, "searching K-limits")
-        limits = compute_k_limit_table(
-            settings, laws, operators or list(OPERATORS), through, workers, dask, progress
+        progress = partial(display.count, "striking walls")
+        operators = operators or list(OPERATORS)
+        dataset = compute_law_table(
+            table, settings, laws, operators, through, workers, dask, progress
         )
-    print(format_k_limit_table(limits, laws))
+    if output is not None:
+        write_sweep(dataset, output)
+    print(format_law_table(dataset))
     return 0
 
 

@@ -414,6 +414,8 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     row.law = rendered.law
     row.stiffness = wall.asked_stiffness
     row.damping = wall.damping
+    row.damping_ratio = wall.damping_ratio
+    row.cap = wall.cap
     row.stiffness_in_force = cycle.guard[0].factor * wall.stiffness
     row.mass_est = estimator.mass
     row.mass_spread = cycle.bank[0].spread

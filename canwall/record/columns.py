@@ -72,6 +72,10 @@ COLUMNS = (
     Column("law", "u1", "", "law of the wall", names_law=True),
     Column("stiffness", "f8", "N·m/rad", "stiffness of the wall, as asked"),
     Column("damping", "f8", "N·m·s/rad", "damping of the wall, in force"),
+    Column("cap", "f8", "", "cap as asked: of the stiffness in force, in mass/T²; 0: none"),
+    Column(
+        "damping_ratio", "f8", "", "damping ratio of the wall, as asked; 0: none, damping as given"
+    ),
     Column("stiffness_in_force", "f8", "N·m/rad", "stiffness that is rendered: as far as the cap"),
     Column("mass_est", "f8", "kg·m²", "mass in force in the model: drive, handle and hand"),
     Column("mass_spread", "f8", "", "its standard deviation, relative; 0: nothing learned"),

@@ -21,7 +21,10 @@ Array = NDArray[np.float64]
 #: Length of a close-up [s].
 _CLOSE_UP_S = 0.045
 #: Columns of the record that the picture needs.
-DRAWN = ("t_s", "y", "torque_applied", "force_applied")
+DRAWN = (
+    *("t_s", "y", "torque_applied", "force_applied"),
+    *("stiffness", "stiffness_in_force", "mass_est", "mass_spread"),
+)
 #: Fixed title positions: no title here has to avoid ticks, and looking for them takes time.
 _QUICK = {"axes.titley": 1.0}
 
@@ -41,7 +44,8 @@ def draw_run(picture: Path, signals: "pa.Table", strikes: list[dict[str, Any]]) 
     """Draw a run into a PNG file and return its path.
 
     The picture shows position and torque over time with the strikes marked, a close-up of one
-    contact of each law (Figure 5.19 of the source), and force over position (Figure 5.3).
+    contact of each law (Figure 5.19 of the source), and force over position (Figure 5.3); mass and
+    stiffness in force as well if the cycle has found the mass itself, or lowered the stiffness.
 
     Raises:
         RecordError: If the file cannot be written.
@@ -50,13 +54,21 @@ def draw_run(picture: Path, signals: "pa.Table", strikes: list[dict[str, Any]]) 
     colours = dict(zip(laws, COLOURS * 4, strict=False))
     shown = [next(s for s in strikes if s["law"] == law) for law in laws[:2]]
     with mpl.rc_context(STYLE | _QUICK):
-        figure = Figure(figsize=(12, 9), layout="constrained", dpi=120)
-        rows = figure.add_gridspec(3, 1, height_ratios=[1.1, 0.9, 1.5])
+        finds = _finds(signals)
+        figure = Figure(figsize=(12, 10.5 if finds else 9), layout="constrained", dpi=120)
+        heights = [1.1, 0.9, *([0.7] if finds else []), 1.5]
+        rows = figure.add_gridspec(len(heights), 1, height_ratios=heights)
         over_time = figure.add_subplot(rows[0])
         torque = figure.add_subplot(rows[1], sharex=over_time)
         draw_strikes(over_time, signals, strikes, colours)
         _torque(torque, signals, strikes, colours)
-        details = rows[2].subgridspec(1, max(len(shown), 1) + 1)
+        if finds:
+            torque.set_xlabel("")
+            torque.tick_params(labelbottom=False)
+            in_force = figure.add_subplot(rows[2], sharex=over_time)
+            draw_in_force(in_force, signals)
+            _mark_strikes(in_force, strikes, colours)
+        details = rows[-1].subgridspec(1, max(len(shown), 1) + 1)
         for column, strike in enumerate(shown):
             _close_up(figure.add_subplot(details[column]), signals, strike, colours)
         _force_over_position(figure.add_subplot(details[-1]), signals, shown, colours)
@@ -121,6 +133,39 @@ def _torque(
     axes.margins(x=0.01)
     axes.set_xlabel("time [s]")
     axes.set_ylabel("torque applied [N·m]")
+
+
+def _finds(signals: "pa.Table") -> bool:
+    """Return True if the cycle has found the mass itself, or lowered the stiffness."""
+    lowered = numbers(signals, "stiffness_in_force") < numbers(signals, "stiffness")
+    return bool(np.any(numbers(signals, "mass_spread") > 0.0) or np.any(lowered))
+
+
+def draw_in_force(axes: Axes, signals: "pa.Table") -> Axes:
+    """Draw stiffness [N·m/rad], asked and in force, and mass [g·m²] over time.
+
+    Returns:
+        The axes of the mass, on the right.
+    """
+    t = numbers(signals, "t_s")
+    asked, in_force = numbers(signals, "stiffness"), numbers(signals, "stiffness_in_force")
+    axes.plot(t, asked, color=COLOURS[2], lw=0.8, ls="--", label="K asked")
+    axes.plot(t, in_force, color=COLOURS[2], lw=1.2, label="K in force")
+    axes.set_ylim(bottom=0.0)
+    axes.set_title("Mass and stiffness in force")
+    axes.set_ylabel("K [N·m/rad]")
+    axes.set_xlabel("time [s]")
+    mass = axes.twinx()
+    mass.plot(t, 1e3 * numbers(signals, "mass_est"), color=COLOURS[3], lw=1.2, label="mass")
+    mass.set_ylim(bottom=0.0)
+    mass.set_ylabel("mass [g·m²]")
+    mass.grid(visible=False)
+    mass.spines["right"].set_visible(True)
+    handles = [*axes.get_lines(), *mass.get_lines()]
+    labels = [str(line.get_label()) for line in handles]
+    # Above the axes: at the wall's stiffness there are lines all along.
+    mass.legend(handles, labels, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3)
+    return mass
 
 
 def _close_up(

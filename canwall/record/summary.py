@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from canwall.analysis import metrics
 from canwall.analysis.felt import HANDLE_RADIUS_M, band_rms, felt_band
-from canwall.analysis.strike import SPAN, first_bounce, first_depth
+from canwall.analysis.strike import SPAN, first_bounce, first_depth, least_in_contact, pressed_cycle
 from canwall.config import Settings
 from canwall.record.columns import Phase
 from canwall.record.folder import numbers
@@ -48,6 +48,7 @@ def summarise(
     touched = metrics.contacts(np.where(rendering, y, np.inf), force)
     strikes = [
         _strike(strike, y, force, work, stiffness, laws, settings, units, referent, referent_felt)
+        | _in_force(strike, y, force, signals)
         for strike in metrics.strikes(touched, settings.bus.cycle_s, _changes(signals))
     ]
     chattering = [s for s in strikes if s["chatter"]]
@@ -56,6 +57,8 @@ def summarise(
         "law": list(dict.fromkeys(stage.wall.law for stage in settings.stages)),
         "stiffness": settings.wall.stiffness_nm_per_rad,
         "damping": settings.wall.damping_nm_s_per_rad,
+        "damping_ratio": settings.wall.damping_ratio,
+        "cap": settings.wall.cap,
         "cycle_s": settings.bus.cycle_s,
         "cycles": signals.num_rows,
         "contacts": len(touched),
@@ -71,7 +74,10 @@ def summarise(
 def _changes(signals: "pa.Table") -> Array:
     """Return the cycles at which law, stiffness, damping or position of the wall change."""
     columns = [np.from_dlpack(signals["law"].combine_chunks().indices)]
-    columns += [numbers(signals, name) for name in ("stiffness", "damping", "wall_position_rad")]
+    asked = ("stiffness", "damping_ratio", "cap", "wall_position_rad")
+    columns += [numbers(signals, name) for name in asked]
+    # The damping that belongs to a damping ratio follows the mass in force.
+    columns.append(np.where(columns[2] > 0.0, 0.0, numbers(signals, "damping")))
     differs = np.any([np.diff(column) != 0 for column in columns], axis=0)
     return np.flatnonzero(differs).astype(float) + 1.0
 
@@ -136,6 +142,22 @@ def _strike(
         "felt_ripple_n": _known(ripple.measured),
         "chatter_amplitude_rad": amplitude,
         "chatter_frequency_hz": frequency,
+    }
+
+
+def _in_force(
+    strike: metrics.StrikeContacts, y: Array, force: Array, signals: "pa.Table"
+) -> dict[str, Any]:
+    """Return what the cycle made of the wall that was asked for, and of the operator."""
+    stiffness = numbers(signals, "stiffness_in_force")
+    last = strike.cycles.start + pressed_cycle(y[strike.cycles], force[strike.cycles])
+    return {
+        "stiffness_in_force": float(stiffness[last]),
+        "stiffness_in_force_least": least_in_contact(
+            y[strike.cycles], force[strike.cycles], stiffness[strike.cycles]
+        ),
+        "mass_est_kg_m2": float(numbers(signals, "mass_est")[last]),
+        "mass_spread": float(numbers(signals, "mass_spread")[last]),
     }
 
 

@@ -51,6 +51,9 @@ _ENABLING, _RENDERING = int(Phase.ENABLING), int(Phase.RENDERING)
 #: N·m per mN·m and per mille.
 _PER_MILLE_MILLI = 1e-6
 
+#: Signals of a loop in memory, see `simulate_loop`.
+SIGNALS = 6
+
 #: SYNCs from the first one to OPERATION ENABLED with the drive of config/sim.toml.
 ENABLING_CYCLES = 7
 
@@ -174,7 +177,7 @@ def simulate(
         ConfigError: If only a run can render the configuration.
     """
     loop = ClosedLoop(settings, cycles, enabling, disturbances)
-    records, rows, signals = loop.records(), np.zeros(cycles, ROW), np.empty((4, cycles))
+    records, rows, signals = loop.records(), np.zeros(cycles, ROW), np.empty((SIGNALS, cycles))
     done = simulate_loop(records, rows, signals)
     trip = Trip(int(records.cycle["trip"][0]))
     lag = int(records.cycle["lag"][0])
@@ -306,9 +309,9 @@ def simulate_loop(loop: LoopRecords, rows: NDArray[np.void], signals: Array) -> 
     Args:
         loop: The loop.
         rows: Rows of the last cycles, shape (n,), dtype ROW: cycle j is in j modulo n.
-        signals: Result, shape (4, cycles): position relative to the wall [rad]; force held from
-            each SYNC on, out of the wall [N·m]; commanded torque [N·m]; mean force on the hand over
-            the cycle [N·m].
+        signals: Result, shape (SIGNALS, cycles): position relative to the wall [rad]; force held
+            from each SYNC on, out of the wall [N·m]; commanded torque [N·m]; mean force on the hand
+            over the cycle [N·m]; stiffness in force [N·m/rad]; mass in the laws' model [kg·m²].
 
     Returns:
         Number of cycles, up to a trip.
@@ -372,6 +375,7 @@ def _run_cycles(loop: LoopRecords, rows: NDArray[np.void], signals: Array) -> in
         oriented = cycle.orientation * counts * cycle.rad_per_count
         signals[0, j] = oriented - cycle.orientation * cycle.rendered[0].position
         signals[1, j], signals[2, j] = row.force_applied, row.torque_cmd
+        signals[4, j], signals[5, j] = row.stiffness_in_force, row.mass_est
         at = at + 1 if at + 1 < len(rows) else 0
         for k in range(MAX_DELAY + 1, 0, -1):
             sent[k] = sent[k - 1]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall import simdrive
-from canwall.analysis import ReferentInputs, follow_referent
+from canwall.analysis import AskedWall, ReferentInputs, follow_referent
 from canwall.analysis.felt import felt_body
 from canwall.compiled import copied
 from canwall.config import Settings, Simulation
@@ -28,17 +28,16 @@ class ReferentMotion(NamedTuple):
 
 
 def referent_motion(
-    settings: Settings, stiffness: Array, damping: Array, wall_position: Array
+    settings: Settings, asked: AskedWall, wall_position: Array
 ) -> ReferentMotion | None:
     """Return the motion of the continuous referent of a run.
 
     The referent is the same hand with the same script on the same handle, against the continuous
-    wall of each cycle.
+    wall at which the law aims in each cycle.
 
     Args:
         settings: Configuration of the run.
-        stiffness: Stiffness of the wall in each cycle [N·m/rad], shape (n,).
-        damping: Damping of the wall in each cycle [N·m·s/rad], shape (n,).
+        asked: The wall that is asked for in each cycle.
         wall_position: Position of the wall in each cycle [rad], shape (n,).
 
     Returns:
@@ -46,9 +45,8 @@ def referent_motion(
     """
     if settings.simulation is None:
         return None
-    return Referent(settings, settings.simulation, len(stiffness)).motion(
-        stiffness, damping, wall_position
-    )
+    referent = Referent(settings, settings.simulation, len(wall_position))
+    return referent.motion(asked, wall_position)
 
 
 class Referent:
@@ -66,10 +64,10 @@ class Referent:
         self._body = body._replace(side=self._side * body.side)
         self._felt = felt_body(self._body, simulation.handle_inertia_kg_m2)
 
-    def motion(self, stiffness: Array, damping: Array, wall_position: Array) -> ReferentMotion:
+    def motion(self, asked: AskedWall, wall_position: Array) -> ReferentMotion:
         """Return the same as `referent_motion`."""
-        motion = ReferentMotion(np.empty(len(stiffness)), np.empty(len(stiffness)))
-        follow_referent(self.inputs(wall_position), stiffness, damping, *motion)
+        motion = ReferentMotion(np.empty(len(wall_position)), np.empty(len(wall_position)))
+        follow_referent(self.inputs(wall_position), asked, *motion)
         return motion
 
     def inputs(self, wall_position: Array) -> ReferentInputs:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from canwall.analysis import AskedWall
 from canwall.config import ConfigError, Settings
 from canwall.cycle import BusMonitor, Exchange, Outcome, WallAxis, timing_summary
 from canwall.drive import DriveSetup
@@ -96,8 +97,8 @@ def write_result(
 
 def judged(signals: "pa.Table", settings: Settings, units: DriveUnits) -> dict[str, Any]:
     """Return what the summary has from the rows, judged against the continuous referent."""
-    wall = (numbers(signals, name) for name in ("stiffness", "damping", "wall_position_rad"))
-    referent = referent_motion(settings, *wall)
+    asked = AskedWall(*(numbers(signals, name) for name in AskedWall._fields))
+    referent = referent_motion(settings, asked, numbers(signals, "wall_position_rad"))
     return summarise(signals, settings, units, *((None, None) if referent is None else referent))
 
 

@@ -13,7 +13,7 @@ from canwall.cycle import with_law
 from canwall.errors import InputError
 from canwall.run.closed_loop import cached_servo_scales, loop_delay
 from canwall.simdrive import TORQUE_LIMITS
-from canwall.sweep.strike import OPERATORS, law_model, strike_settings
+from canwall.sweep.strike import OPERATORS, SERVOS, STICTION, law_model, strike_settings
 from canwall.walls import MAX_DELAY
 
 #: Largest number of values on one axis: more of them are a typing error.
@@ -36,7 +36,9 @@ NAMED = {
     "operator": ("", "operator at the handle"),
     "model": ("", "model of the laws: matched, drive, file"),
     "model_error": ("1", "relative error of the model's inertia"),
-    "servo": ("", "file: as configured; ideal: as with simulation.ideal"),
+    "servo": ("", "file: as configured; ideal: as with simulation.ideal; 1600Hz, 800Hz: real ones"),
+    "friction": ("N*m", "Coulomb friction; 1.5 times as much holds at rest"),
+    "delay_error": ("1", "error of the D that the laws reckon with, in cycles"),
     "speed": ("rad/s", "mean speed of the hand's approach"),
     "phase": ("1", "phase of the contact relative to the SYNC"),
     "start": ("rad", "distance from the wall at which the handle rests before the strike"),
@@ -54,6 +56,7 @@ DEFAULTS: dict[str, tuple[Value, ...]] = {
     "model": ("matched",),
     "model_error": (0.0,),
     "servo": ("file",),
+    "delay_error": (0.0,),
     "start": (0.03,),
     "press": (0.6,),
     "press_torque": (0.15,),
@@ -61,9 +64,17 @@ DEFAULTS: dict[str, tuple[Value, ...]] = {
     "speed": (0.5, 1.0, 2.0),
     "phase": (0.0, 0.35, 0.7),
 }
+#: Axes of numbers that may be zero.
+_MAY_BE_ZERO = (
+    *DAMPING,
+    "delay",
+    "phase",
+    "sync_jitter",
+    "friction",
+)
 _CHOICES = {
     "model": ("matched", "drive", "file"),
-    "servo": ("file", "ideal"),
+    "servo": ("file", "ideal", *SERVOS),
     "operator": tuple(OPERATORS),
 }
 
@@ -144,8 +155,8 @@ def _check(name: str, value: Value) -> None:
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if not number or not math.isfinite(value):  # type: ignore[arg-type]
         raise InputError(f"sweep axis {name}: has to be a number, not {value!r}")
-    low = {"model_error": -1.0}.get(name, 0.0)
-    low_allowed = name in ("damping", "damping_normalised", "delay", "phase", "sync_jitter")
+    low = {"model_error": -1.0, "delay_error": -MAX_DELAY}.get(name, 0.0)
+    low_allowed = name in _MAY_BE_ZERO
     if not (value > low or (low_allowed and value == low)):  # type: ignore[operator]
         bound = "at least" if low_allowed else "greater than"
         raise InputError(f"sweep axis {name}: has to be {bound} {low:g}, not {value!r}")
@@ -175,13 +186,23 @@ def settings_at(base: Settings, point: Point) -> Settings:
     model = law_model(settings, str(values["model"]), float(values["model_error"]))
     settings = settings.model_copy(update={"mechanics": model})
     settings = _with_keys(settings, {k: v for k, v in keys.items() if _of_the_model(k)})
-    if settings.estimator.delay_cycles is None:
-        known = {"delay_cycles": loop_delay(settings), "measure_delay": False}
-        settings = settings.model_copy(
-            update={"estimator": settings.estimator.model_copy(update=known)}
-        )
+    settings = _with_known_delay(settings, float(values["delay_error"]))
     strike = (float(values[n]) for n in ("speed", "phase", "start", "press", "press_torque"))
     return strike_settings(settings, *strike)
+
+
+def _with_known_delay(settings: Settings, error: float) -> Settings:
+    """Tell the laws the delay of the loop, unless they have one, with an error [cycles]."""
+    delay = settings.estimator.delay_cycles
+    if delay is None:
+        delay = loop_delay(settings)
+    if not 0.0 <= delay + error <= MAX_DELAY:
+        raise ConfigError(
+            f"sweep axis delay_error: {error:g} makes D = {delay + error:g}; it has to be between "
+            f"0 and {MAX_DELAY}"
+        )
+    known = {"delay_cycles": delay + error, "measure_delay": False}
+    return settings.model_copy(update={"estimator": settings.estimator.model_copy(update=known)})
 
 
 def _of_the_model(key: str) -> bool:
@@ -242,6 +263,16 @@ def _with_torque_step(settings: Settings, step: Value) -> Settings:
     return _with_objects(settings, objects, peak_torque_nm=peak)
 
 
+def _with_servo(settings: Settings, name: Value) -> Settings:
+    servo = SERVOS.get(str(name))
+    return with_overrides(settings, servo.keys) if servo else settings
+
+
+def _with_friction(settings: Settings, coulomb: Value) -> Settings:
+    keys = {"coulomb_nm": float(coulomb), "stiction_nm": STICTION * float(coulomb)}
+    return with_overrides(settings, {f"simulation.{key}": value for key, value in keys.items()})
+
+
 def _with_operator(settings: Settings, name: Value) -> Settings:
     return with_overrides(settings, OPERATORS[str(name)].keys)
 
@@ -254,4 +285,6 @@ _CHANGES: dict[str, Callable[[Settings, Value], Settings]] = {
     "counts": _with_counts,
     "torque_step": _with_torque_step,
     "operator": _with_operator,
+    "servo": _with_servo,
+    "friction": _with_friction,
 }

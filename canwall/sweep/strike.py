@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from canwall.analysis import ReferentInputs, follow_referent
+from canwall.analysis import AskedWall, ReferentInputs, follow_referent
 from canwall.analysis.felt import HANDLE_RADIUS_M, FeltBand, felt_band
 from canwall.analysis.strike import MEASURES, measure_strike
 from canwall.compiled import Record, compiled
@@ -17,6 +17,7 @@ from canwall.record import ROW, Phase, Ring
 from canwall.run import drive_dictionary, make_axis, make_exchange, on_the_bus, render
 from canwall.run.closed_loop import (
     ENABLING_CYCLES,
+    SIGNALS,
     ClosedLoop,
     Disturbances,
     LoopRecords,
@@ -57,17 +58,49 @@ def _at_radius(name: str, mass_kg: float, damping: float, stiffness: float) -> O
     return Operator(name, mass_kg * square, damping * square, stiffness * square)
 
 
-#: Operators within the ranges of theory, section 7. In a grip the fingers hold the handle: 50 g,
-#: as stiff and damped as a stiff finger.
+#: Operators within the ranges of theory, section 7, from nobody to a hand with its arm.
 OPERATORS = {
     operator.name: operator
     for operator in (
         Operator("none", 0.0, 0.0, 0.0),
-        _at_radius("finger", 0.010, 4.0, 500.0),
-        _at_radius("grip", 0.050, 8.0, 1200.0),
-        _at_radius("hand", 0.55, 6.5, 135.0),
+        _at_radius("fingertip", 0.004, 2.0, 300.0),
+        _at_radius("finger", 0.020, 4.0, 500.0),
+        _at_radius("grip", 0.050, 6.0, 800.0),
+        _at_radius("hand", 0.200, 6.5, 400.0),
+        _at_radius("arm", 0.550, 6.5, 135.0),
     )
 }
+
+
+@dataclass(frozen=True)
+class Servo:
+    """What a servo adds to an ideal one (theory, section 8), known to the model of the laws.
+
+    Attributes:
+        name: Name on the axis `servo`.
+        current_bandwidth_hz: Bandwidth of its current loop [Hz].
+        drive_cycle_s: Period of its own cycle [s].
+    """
+
+    name: str
+    current_bandwidth_hz: float
+    drive_cycle_s: float
+
+    @property
+    def keys(self) -> dict[str, float]:
+        """Values of the keys of a configuration; its crystal is off by some tens of ppm."""
+        known = {key: value for key, value in vars(self).items() if key != "name"}
+        simulated = known | {"clock_ppm": 50.0, "ideal": False}
+        return {f"drive.{key}": value for key, value in known.items()} | {
+            f"simulation.{key}": value for key, value in simulated.items()
+        }
+
+
+SERVOS = {
+    servo.name: servo for servo in (Servo("1600Hz", 1600.0, 0.00025), Servo("800Hz", 800.0, 0.0004))
+}
+#: Torque at which a handle breaks away, over the Coulomb friction (theory, section 8).
+STICTION = 1.5
 
 _FIRST_STRIKE_S = 0.05
 _AFTERWARDS_S = 0.25
@@ -201,6 +234,14 @@ class PreparedStrike:
         ).records()
         referent = Referent(settings, settings.simulation, self._cycles)
         self._referent = referent.inputs(np.full(self._cycles, settings.wall.position_rad))
+        # Each wall fills in its own stiffness and damping.
+        wall = settings.wall
+        self._asked = AskedWall(
+            *(
+                np.full(self._cycles, value or 0.0)
+                for value in (None, None, wall.damping_ratio, wall.cap)
+            )
+        )
         self._band = felt_band(settings.bus.cycle_s)
         self._radius = settings.mechanics.handle_radius_m or HANDLE_RADIUS_M
         self._by_frames = through == "bus"
@@ -249,6 +290,7 @@ class PreparedStrike:
             _strike_all(
                 self._loop,
                 self._referent,
+                AskedWall(*(values.copy() for values in self._asked)),
                 self._band,
                 self._radius,
                 walls,
@@ -264,14 +306,16 @@ class PreparedStrike:
         )
         felt = self._felt_under(signals[2], stiffness, damping)
         referent, referent_felt = np.empty(self._cycles), np.empty(self._cycles)
-        each = np.full(self._cycles, stiffness), np.full(self._cycles, damping)
-        follow_referent(self._referent, *each, referent, referent_felt)
+        asked = self._asked._replace(
+            stiffness=np.full(self._cycles, stiffness), damping=np.full(self._cycles, damping)
+        )
+        follow_referent(self._referent, asked, referent, referent_felt)
         measures = np.zeros(1, MEASURES)
         _judge(
             self._loop,
             self._band,
             self._radius,
-            np.concatenate([signals, felt[None, :]]),
+            np.concatenate([signals[:3], felt[None, :], signals[3:]]),
             trip,
             referent,
             referent_felt,
@@ -285,7 +329,7 @@ class PreparedStrike:
 
         They are those of the loop in memory, as long as it commands the same torques; NaN after.
         """
-        again = np.empty((4, self._cycles))
+        again = np.empty((SIGNALS, self._cycles))
         done = simulate_wall(self._loop, stiffness, damping, np.zeros(1, ROW), again)
         again = again[:, self._loop.enabling : done]
         shared = min(len(torque), again.shape[1])
@@ -300,22 +344,22 @@ class PreparedStrike:
 def _strike_all(
     loop: LoopRecords,
     hand: ReferentInputs,
+    asked: AskedWall,
     band: FeltBand,
     radius: float,
     walls: Array,
     rows: NDArray[np.void],
     measures: NDArray[np.void],
 ) -> None:
-    """Strike and judge every wall; rows, shape (1,) and dtype ROW, is scratch memory."""
+    """Strike and judge every wall; rows, shape (1,) and dtype ROW, and asked are scratch memory."""
     cycles = len(loop.push)
-    signals = np.empty((4, cycles))
-    stiffness, damping = np.empty(cycles), np.empty(cycles)
+    signals = np.empty((SIGNALS, cycles))
     referent, referent_felt = np.empty(cycles), np.empty(cycles)
     for i in range(len(walls)):
-        stiffness[:], damping[:] = walls[i, 0], walls[i, 1]
+        asked.stiffness[:], asked.damping[:] = walls[i, 0], walls[i, 1]
         done = simulate_wall(loop, walls[i, 0], walls[i, 1], rows, signals)
         cycle: Record = loop.cycle[0]
-        follow_referent(hand, stiffness, damping, referent, referent_felt)
+        follow_referent(hand, asked, referent, referent_felt)
         _judge(
             loop,
             band,
@@ -343,7 +387,7 @@ def _judge(
 ) -> None:
     """Judge one strike into measures, shape (1,).
 
-    signals, shape (4, n), are those of `simulate_loop` from the end of enabling on.
+    signals, shape (SIGNALS, n), are those of `simulate_loop` from the end of enabling on.
     """
     cycle: Record = loop.cycle[0]
     rendered = slice(loop.enabling, loop.enabling + signals.shape[1])
@@ -354,6 +398,7 @@ def _judge(
         trip,
         trip != 0 and not _exceeds_limits(cycle, referent),
         signals[3],
+        signals[4:],
         referent[rendered],
         referent_felt[rendered],
         cycle.period,
@@ -385,8 +430,8 @@ def signals_over_bus(settings: Settings) -> tuple[Array, int]:
     """Render the wall of a strike by frames, on an embedded bus.
 
     Returns:
-        The first three signals of `simulate_loop` from the end of enabling on, shape (3, n), and
-        the trip.
+        The signals of `simulate_loop` from the end of enabling on, without the force on the hand,
+        shape (SIGNALS - 1, n), and the trip.
     """
     # Each thread has a bus: others may strike at the same time.
     channel = f"{settings.bus.channel}-{threading.get_ident()}"
@@ -409,5 +454,5 @@ def signals_over_bus(settings: Settings) -> tuple[Array, int]:
         ring.close()
     rows = np.concatenate(pieces)
     rows = rows[rows["phase"] == Phase.RENDERING]
-    signals = np.array([rows[name] for name in ("y", "force_applied", "torque_cmd")])
-    return signals, int(axis.cycle["trip"][0])
+    names = ("y", "force_applied", "torque_cmd", "stiffness_in_force", "mass_est")
+    return np.array([rows[name] for name in names]), int(axis.cycle["trip"][0])

@@ -49,6 +49,7 @@ def ineffective_axis_notes(dataset: xr.Dataset) -> list[str]:
 
 def _limit_rows(dataset: xr.Dataset) -> Iterator[dict[str, str]]:
     worst = dataset["worst"]
+    lowered = _is_lowered(dataset["stiffness_in_force"], worst)
     for labels, index in _conditions(dataset, [str(d) for d in worst.dims]):
         limit = worst.isel(index).item()
         best = dataset["limit"].isel(index).max().item()
@@ -58,12 +59,28 @@ def _limit_rows(dataset: xr.Dataset) -> Iterator[dict[str, str]]:
         yield labels | {
             "K\n[N·m/rad]": at_least + f"{limit:.3g}",
             "K·T²/m": at_least + f"{normalised:.3g}",
+            **(
+                {"K in\nforce": _least(dataset["stiffness_in_force"].isel(index))}
+                if lowered
+                else {}
+            ),
             "best strike\n÷ worst": f"{best / limit:.3g}" if limit > 0.0 else "–",
             "ripple\n[N]": _worst(dataset["ripple"].isel(index)),
             "first depth\n÷ referent": _worst(
                 (dataset["first_depth"] / dataset["referent_first_depth"]).isel(index)
             ),
         }
+
+
+def _is_lowered(in_force: xr.DataArray, asked: xr.DataArray) -> bool:
+    """Return True if a stiffness in force is below the one that was asked for, by a cap."""
+    return bool((in_force < asked * (1.0 - 1e-9)).any())
+
+
+def _least(values: xr.DataArray) -> str:
+    """Return the least known value of all strikes."""
+    known = values.values[np.isfinite(values.values)]
+    return f"{known.min():.3g}" if known.size else "–"
 
 
 def _worst(values: xr.DataArray) -> str:
@@ -75,6 +92,11 @@ def _worst(values: xr.DataArray) -> str:
 def _map_rows(dataset: xr.Dataset) -> Iterator[dict[str, str]]:
     wall = [axis_name(dataset, DAMPING), axis_name(dataset, STIFFNESS)]
     chatters = dataset["chatters"].any(STRIKES).transpose(..., *wall)
+    asked = dataset[wall[1]]
+    if wall[1] != "stiffness":
+        asked = asked * dataset["inertia"] / dataset["period"] ** 2
+    share = dataset["stiffness_in_force"] / asked
+    lowered = _is_lowered(share, xr.ones_like(share))
     for labels, index in _conditions(dataset, [str(d) for d in chatters.dims if d not in wall]):
         map_chatters = chatters.isel(index).values
         stiffness = dataset[wall[1]].values
@@ -85,6 +107,7 @@ def _map_rows(dataset: xr.Dataset) -> Iterator[dict[str, str]]:
             "walls": str(map_chatters.size),
             "free": str(int((~map_chatters).sum())),
             f"free up to\n{wall[1]}": f"{stiffness[free - 1]:.3g}" if free else "none",
+            **({"K in force\n÷ asked": _least(share.isel(index))} if lowered else {}),
             "energy out\n[mJ], at most": f"{energy_out * 1e3:.3g}",
         }
 

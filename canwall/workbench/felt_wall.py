@@ -14,6 +14,7 @@ from canwall.figure_style import COLOURS
 from canwall.record import ROW
 from canwall.run.closed_loop import (
     ENABLING_CYCLES,
+    SIGNALS,
     ClosedLoop,
     loop_delay,
     simulate_loop,
@@ -82,7 +83,7 @@ def measure_impedance(law: str) -> EffectiveImpedance:
     push[:ENABLING_CYCLES] = 0.0
     slope = np.diff(push, append=push[-1]) / settings.bus.cycle_s
     loop = ClosedLoop(settings, cycles).records()._replace(push=push, slope=slope)
-    signals = np.empty((4, cycles))
+    signals = np.empty((SIGNALS, cycles))
     simulate_loop(loop, np.zeros(1, ROW), signals)
     push, y = push.reshape(_PERIODS, -1), signals[0].reshape(_PERIODS, -1)
     return impedance_at_lines(push[_FIRST:], y[_FIRST:], settings.bus.cycle_s, _LINES)
@@ -140,7 +141,7 @@ def plain_wall_motion(beta: float, sigma: float) -> float:
     settings = strike_settings(settings, 0.5, 0.3, 0.01, 0.5, 0.15)
     assert settings.run.duration_s is not None
     cycles = round(settings.run.duration_s / period)
-    signals = np.empty((4, cycles))
+    signals = np.empty((SIGNALS, cycles))
     done = simulate_loop(ClosedLoop(settings, cycles).records(), np.zeros(1, ROW), signals)
     if done < cycles:
         return float("inf")  # a limit has ended it

@@ -12,7 +12,7 @@ from numba import njit
 
 from canwall import config
 from canwall.record import ROW
-from canwall.run.closed_loop import ClosedLoop, simulate_wall
+from canwall.run.closed_loop import SIGNALS, ClosedLoop, simulate_wall
 from canwall.sweep import make_plan
 from canwall.sweep.plan import Plan
 from canwall.sweep.workers import compute_pieces
@@ -40,7 +40,7 @@ def closed_loop() -> dict[str, Any]:
     found = {}
     for law in ("standard", "half_sample", "mean_force", "push_only"):
         ready = ClosedLoop(_struck(law), _STRIKE).records()
-        into = ready, 50.0, 0.0, np.zeros(1, ROW), np.empty((3, _STRIKE))
+        into = ready, 50.0, 0.0, np.zeros(1, ROW), np.empty((SIGNALS, _STRIKE))
         simulate_wall(*into)
         found[law] = round(
             100 * _STRIKE / _seconds(lambda into=into: [simulate_wall(*into) for _ in range(100)])  # type: ignore[misc]

@@ -5,8 +5,10 @@ import math
 import numpy as np
 import pytest
 from rig import settings_with
+from scipy.integrate import solve_ivp
 
-from canwall.config import Settings
+from canwall.analysis import AskedWall
+from canwall.config import Settings, with_overrides
 from canwall.run.referent import referent_motion
 from canwall.simdrive import ServoMotion
 
@@ -21,7 +23,7 @@ def test_without_a_wall_it_moves_as_the_handle_does(grip: bool, side: str) -> No
     settings: Settings = base.model_copy(update={"simulation": simulation})
     nothing, position = np.zeros(1500), np.full(1500, 0.013)
     position[700:] = -0.02  # the wall is moved, the handle is not
-    referent = referent_motion(settings, nothing, nothing, position)
+    referent = referent_motion(settings, AskedWall(*[nothing] * 4), position)
     assert referent is not None
     motion = ServoMotion(simulation, settings.bus.cycle_s, 2.0 * math.pi * 1e6)
     seen, parted = [], False
@@ -33,3 +35,48 @@ def test_without_a_wall_it_moves_as_the_handle_does(grip: bool, side: str) -> No
     np.testing.assert_allclose(sign * referent.y + position, seen, rtol=0.0, atol=1e-9)
     assert np.ptp(seen) > 0.1
     assert parted is not grip
+
+
+def test_damping_and_cap_are_those_of_the_mass_that_moves() -> None:
+    """The wall is max(0, −K·y − 2·ζ·√(K·m)·ẏ), K = c·m/T², m of drive and hand, whatever B says."""
+    asked, ratio, press = 5000.0, 0.5, -0.2
+    hand = {
+        "simulation.hand.strikes": 1,
+        "simulation.hand.first_strike_s": 0.0,
+        "simulation.hand.rest_rad": 0.0,
+        "simulation.hand.press_rad": 0.0,
+        "simulation.hand.press_torque_nm": press,
+        "simulation.hand.approach_s": 0.02,
+        "simulation.hand.stiffness_nm_per_rad": 0.0,
+        "simulation.coulomb_nm": 0.0,
+    }
+    base = with_overrides(settings_with(), hand).with_ideal_servo()
+    assert base.simulation is not None
+    settings = base.model_copy(update={"schedule": ()})
+    n, period = 120, settings.bus.cycle_s
+    each = np.ones(n)
+    cap = 0.6
+    wall = AskedWall(asked * each, 7.0 * each, ratio * each, cap * each)
+    found = referent_motion(settings, wall, 0.0 * each)
+    assert found is not None
+    simulation = base.simulation
+    mass = simulation.inertia_kg_m2 + simulation.hand.inertia_kg_m2
+    viscous = simulation.viscous_nm_s_per_rad + simulation.hand.damping_nm_s_per_rad
+    stiffness = cap * mass / period**2
+    damping = 2.0 * ratio * math.sqrt(stiffness * mass)
+
+    def push(t: float) -> float:
+        # The muscle's torque, straight from SYNC to SYNC.
+        s = np.clip(np.arange(n + 1) * period / 0.02, 0.0, 1.0)
+        torque = press * s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+        return float(np.interp(t, np.arange(n + 1) * period, torque))
+
+    def motion(t: float, x: tuple[float, float]) -> tuple[float, float]:
+        y, v = x
+        wall = max(0.0, -stiffness * y - damping * v) if y < 0.0 else 0.0
+        return v, (wall + push(t) - viscous * v) / mass
+
+    t = np.arange(n) * period
+    exact = solve_ivp(motion, (0.0, t[-1]), (0.0, 0.0), t_eval=t, rtol=1e-9, max_step=1e-4).y[0]
+    np.testing.assert_allclose(found.y, exact, atol=1e-6)
+    assert found.y.min() < press / stiffness  # it overshoots: it is not overdamped

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from canwall.analysis.strike import first_bounce, first_depth
+from canwall.analysis.strike import first_bounce, first_depth, pressed_cycle
 
 
 def test_only_the_first_contact_counts() -> None:
@@ -21,3 +21,12 @@ def test_restitution_is_speed_out_over_speed_in(restitution: float) -> None:
     speed, found = first_bounce(y, 1e-3)
     assert speed == pytest.approx(-1.0)
     assert found == pytest.approx(restitution)
+
+
+def test_a_wall_is_known_best_before_the_hand_leaves_it() -> None:
+    y = np.ones(200)
+    y[10:15] = y[50:150] = y[160:190] = -1.0
+    force = np.zeros(200)
+    force[150:152] = 1.0  # held for two cycles more
+    assert pressed_cycle(y, force) == 50 + int(102 * 0.9) - 1
+    assert pressed_cycle(y[:13], force) == 10 + 1

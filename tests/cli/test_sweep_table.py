@@ -1,22 +1,22 @@
-"""`canwall sweep --table`: K-limits as Markdown on standard output, progress on standard error."""
+"""`canwall sweep --table`: Markdown on standard output, progress on standard error."""
 
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from commands import config_file
 
-from canwall import cli
-from canwall.sweep import k_limit_table
+from canwall import cli, config
+from canwall.sweep import LAW_TABLES, law_tables, make_plan, read_sweep, sweep
 
-#: Cells of the documented table, without what depends on the dampings that are searched.
-STANDARD, HALF_SAMPLE = "18.1; **0.11**; 1×; ", "230; **1.41**; 12.7×; "
+SERVO = config.shipped("config/servo.toml")
 
 
 def rows_of(output: str) -> list[list[str]]:
     return [
         [cell.strip() for cell in line.strip("|").split("|")]
         for line in output.splitlines()
-        if line.startswith("|")
+        if line.startswith("|") and not line.startswith("|---")
     ]
 
 
@@ -24,47 +24,113 @@ def run(*arguments: object) -> int:
     return cli.guarded(lambda: cli.app([*map(str, arguments)], standalone_mode=False))
 
 
+def copy_of_servo(folder: Path, text: str, other: str) -> Path:
+    """config/servo.toml with another text in place of this one."""
+    file = folder / "servo.toml"
+    content = SERVO.read_text().replace("../eds", str(SERVO.parents[1] / "eds"))
+    file.write_text(content.replace(text, other))
+    return file
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fewer strikes, dampings and conditions."""
+    monkeypatch.setattr(law_tables, "DAMPINGS", (0.05, 0.4))
+    axes = {
+        "laws": {"servo": ["1600Hz"], "friction": [0.02], "delay_error": [-0.3, 0.0]},
+        "cap": {"servo": ["800Hz"], "friction": [0.0], "delay_error": [0.0], "stiffness": [4000.0]},
+        "first-strike": {"servo": ["1600Hz"], "friction": [0.02]},
+        "shaft": {"simulation.shaft_hz": [400.0]},
+    }
+    for name, few in axes.items():
+        fewer = LAW_TABLES[name].axes | few | {"speed": [1.0], "phase": [0.35]}
+        monkeypatch.setitem(LAW_TABLES, name, replace(LAW_TABLES[name], axes=fewer))
+
+
 @pytest.mark.slow
-def test_table_of_two_laws(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(k_limit_table, "DAMPINGS", (0.05, 0.5))
+@pytest.mark.usefixtures("small")
+def test_k_limits_are_those_of_a_sweep(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     # Axes of the file would be further dimensions of the table.
-    file = config_file(tmp_path / "config.toml")
+    file = copy_of_servo(tmp_path, "[sweep]", "")
     file.write_text(file.read_text() + '\n[sweep]\nrate = "100:1000:10"\n')
-    laws = ("--law", "half_sample", "--law", "damped", "--law", "standard")
-    assert run("sweep", file, "--table", *laws, "--operator", "finger") == 0
+    asked = ("--law", "mean_force", "--operator", "finger", "--output", tmp_path / "laws.nc")
+    assert run("sweep", file, "--table", "laws", *asked) == 0
     said = capsys.readouterr()
     assert said.err == ""
-    assert [line for line in said.out.splitlines() if line.startswith("With")] == [
-        "With the model matched:",
-        "With a model that knows only the drive:",
-    ]
-    rows = rows_of(said.out)
-    assert len(rows) == 2 * 5
-    head, rule, half_sample, damped, standard = rows[:5]
-    assert (head, rule) == (["law", "finger"], ["---", "---"])
-    assert [row[0] for row in (half_sample, damped, standard)] == [
-        *("half_sample", "damped", "standard"),
-    ]
-    assert half_sample[1].startswith(HALF_SAMPLE)
-    assert standard[1].startswith(STANDARD)
-    # At the better of the two dampings, relative to the standard wall and to itself.
-    assert damped[1] == "33.8; **0.206** at 0.5; 1.87×; 1×"
-    assert rows[7][1].startswith("103; **0.629**; 5.7×; ")
+    written = read_sweep(tmp_path / "laws.nc")
+    assert list(written["law"].values) == ["standard", "damped", "mean_force"]
+    worst, known, off = (rows_of(part) for part in re.split(r"\n\n(?=1600|Delay)", said.out))
+    assert [row[0] for row in known[1:]] == ["standard", "damped", "mean_force"]
+    assert float(worst[3][1].partition("*; ")[0].strip("*")) == pytest.approx(
+        written["worst_normalised"].sel(law="mean_force").min().item(), rel=5e-3
+    )
+    assert [row[0] for row in off[1:]] == ["mean_force, 1600 Hz + 0.25 ms"]
+    # The same walls, one by one, without a cap and with what each law may know.
+    settings = config.load(SERVO)
+    wall = settings.wall.model_copy(update={"cap": None})
+    knowing = settings.model_copy(update={"wall": wall})
+    plain = settings.model_copy(
+        update={
+            "wall": wall.model_copy(update={"damping_ratio": None}),
+            "operator": settings.operator.model_copy(update={"adapt": False}),
+        }
+    )
+    axes = {
+        **{"operator": "finger", "model": "drive", "servo": "1600Hz", "friction": 0.02},
+        **{"speed": 1.0, "phase": 0.35, "press": 1.2},
+    }
+    for base, law, more, row in (
+        (plain, "standard", {}, known[1]),
+        (plain, "damped", {"damping_normalised": [0.05, 0.4]}, known[2]),
+        (knowing, "mean_force", {}, known[3]),
+    ):
+        alone = sweep(make_plan(base, {"law": law, **axes, **more}), tmp_path / f"{law}.nc")
+        best = alone["worst_normalised"].max().item()
+        assert f"**{best:.3g}**" in row[1]
+        assert f"; {best * (1e-4 + 0.02 * 0.08**2) / 1e-6:.3g}" in row[1]
+        assert written["worst_normalised"].sel(law=law, delay_error=0.0).item() == best
+    late = sweep(
+        make_plan(knowing, {"law": "mean_force", **axes, "delay_error": -0.3}), tmp_path / "d.nc"
+    )
+    assert off[1][1] == f"{late['worst_normalised'].item():.3g}"
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("small")
+def test_cap_is_what_is_in_force(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A grip of 4.2e-4 kg·m² on a wall that takes it for a free handle of 1e-4 kg·m²."""
+    file = copy_of_servo(tmp_path, "adapt = true", "adapt = false")
+    assert run("sweep", file, "--table", "cap", "--operator", "grip") == 0
+    head, *rows = rows_of(capsys.readouterr().out)
+    assert head == ["", "grip"]
+    assert [row[1] for row in rows if "failed" in row[0]] == ["1 of 1", "1 of 1"]
+    half, full = (float(row[1]) for row in rows if "least" in row[0])
+    assert half == pytest.approx(0.5 / 4.2, rel=5e-3)
+    assert full == pytest.approx(1.0 / 4.2, rel=5e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("small")
+@pytest.mark.parametrize("table", ["first-strike", "shaft"])
+def test_other_tables(table: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("sweep", SERVO, "--table", table, "--operator", "none") == 0
+    head, *rows = rows_of(capsys.readouterr().out)
+    assert head == ["", "none"]
+    for _, cell in rows:
+        assert cell == "–" or float(re.findall(r"[\d.e-]+", cell)[0]) >= 0.0
 
 
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        (["--output", "a.nc"], "--table has fixed axes and writes no file: leave out --output"),
         (["--stiffness", "1:9:3", "--resume"], "leave out --stiffness, --resume"),
         (["--rate", "1000"], "leave out --rate"),
         (["--damping", "0"], "leave out --damping"),
         (["--axis", "speed=1"], "leave out --axis"),
         (["--law", "none"], "wall.law: unknown law 'none'"),
-        (["--operator", "giant"], "sweep axis operator: has to be one of none, finger"),
+        (["--operator", "giant"], "sweep axis operator: has to be one of none, fingertip"),
         (["--through", "air"], "--through air: has to be sim or bus"),
+        (["--output", "there"], "there: exists already; choose another --output"),
         (["--workers", "2", "--dask", "nowhere"], "--workers and --dask: keep one"),
         pytest.param(
             ["--dask", "nowhere"], "--dask nowhere: no scheduler there", marks=pytest.mark.slow
@@ -79,12 +145,20 @@ def test_options_without_a_meaning_for_the_table(
     line: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert run("sweep", "--table", *arguments) == 2
+    Path("there").touch()
+    assert run("sweep", "--table", "laws", *arguments) == 2
     said = capsys.readouterr()
     assert said.out == ""
     assert len(said.err.splitlines()) == 1
     assert line in said.err
-    assert list(tmp_path.iterdir()) == []
+    assert [path.name for path in tmp_path.iterdir()] == ["there"]
+
+
+def test_unknown_table(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("sweep", "--table", "log") == 2
+    assert capsys.readouterr().err == (
+        "canwall: --table log: has to be one of laws, cap, first-strike, shaft\n"
+    )
 
 
 def test_a_sweep_needs_a_file_for_its_result(capsys: pytest.CaptureFixture[str]) -> None:

@@ -158,7 +158,7 @@ def test_a_guard_that_only_warns_changes_no_bit() -> None:
 
 
 #: K·T²/m at which the plain wall begins to chatter, by operator.
-LIMITS = {"none": 0.004, "finger": 0.11, "grip": 0.08, "hand": 0.004}
+LIMITS = {"none": 0.004, "finger": 0.11, "grip": 0.08, "arm": 0.004}
 
 
 @pytest.mark.slow

@@ -1,17 +1,24 @@
 """Judgement of a run by what is felt: the estimate from the torque beside the force itself."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from rich.console import Console
 from rig import settings_with
 
+from canwall import config
 from canwall.analysis.felt import band_rms, felt_band
+from canwall.cli.run import _strike_table
 from canwall.config import Settings
 from canwall.record import ROW
 from canwall.record.columns import record_batch
-from canwall.run.closed_loop import ClosedLoop, simulate_loop
+from canwall.record.pictures import draw_run
+from canwall.run.closed_loop import SIGNALS, ClosedLoop, simulate, simulate_loop
 from canwall.run.result import judged
 from canwall.sweep.axes import settings_at
 
@@ -23,7 +30,8 @@ def strike(operator: str, stiffness: float) -> tuple[pa.Table, Settings, Any, fl
     settings = settings_at(base, axes)
     assert settings.run.duration_s is not None
     cycles = round(settings.run.duration_s / settings.bus.cycle_s)
-    loop, rows, signals = ClosedLoop(settings, cycles), np.zeros(cycles, ROW), np.empty((4, cycles))
+    loop, rows = ClosedLoop(settings, cycles), np.zeros(cycles, ROW)
+    signals = np.empty((SIGNALS, cycles))
     assert simulate_loop(loop.records(), rows, signals) == cycles
     pressing = signals[3, 350:640]
     felt = band_rms(felt_band(settings.bus.cycle_s), pressing, 200, len(pressing)) / 0.08
@@ -31,9 +39,9 @@ def strike(operator: str, stiffness: float) -> tuple[pa.Table, Settings, Any, fl
     return table, settings, loop.units, felt
 
 
-@pytest.mark.parametrize(("operator", "share"), [("grip", 3.2 / 4.2), ("finger", 0.64 / 1.64)])
+@pytest.mark.parametrize(("operator", "share"), [("grip", 3.2 / 4.2), ("finger", 1.28 / 2.28)])
 def test_a_run_that_buzzes_is_judged_by_its_torque(operator: str, share: float) -> None:
-    table, settings, units, felt = strike(operator, 900.0 if operator == "grip" else 280.0)
+    table, settings, units, felt = strike(operator, 900.0 if operator == "grip" else 430.0)
     (judgement,) = judged(table, settings, units)["strikes"]
     assert felt > 0.1
     assert judgement["chatter"]
@@ -45,9 +53,14 @@ def test_a_run_that_buzzes_is_judged_by_its_torque(operator: str, share: float) 
     assert judgement["chatter"]
     assert judgement["referent_first_depth_rad"] is None
     # Its bounces at first are counted without those of a referent.
-    assert judgement["chatter_by"] == ("counts" if operator == "grip" else "ripple")
-    if operator == "finger":
-        assert "estimated from the torque" in judgement["chatter_reason"]
+    assert judgement["chatter_by"] == "counts"
+
+
+def test_a_person_s_run_is_judged_by_the_estimate_alone() -> None:
+    table, settings, units, _ = strike("fingertip", 180.0)
+    (judgement,) = judged(table, settings.model_copy(update={"simulation": None}), units)["strikes"]
+    assert judgement["chatter_by"] == "ripple"
+    assert "estimated from the torque" in judgement["chatter_reason"]
 
 
 @pytest.mark.parametrize("operator", ["none", "finger", "grip"])
@@ -63,3 +76,62 @@ def test_a_quiet_run_is_quiet_with_and_without_a_referent(operator: str) -> None
     (judgement,) = judged(table, settings, units)["strikes"]
     assert judgement["first_depth_rad"] < 1.8 * judgement["referent_first_depth_rad"]
     assert judgement["restitution"] is None or judgement["restitution"] < 1.0
+
+
+@pytest.fixture(scope="module")
+def unknown() -> tuple[pa.Table, dict[str, Any]]:
+    """Record and judgement of a grip's strike on a wall that has to find it out."""
+    base = config.load(
+        config.shipped("config/servo.toml"),
+        {"wall.stiffness_nm_per_rad": 2000.0, "wall.cap": 0.5, "wall.damping_ratio": 0.5},
+    )
+    settings = settings_at(base, {"operator": "grip", "model": "drive", "speed": 1.0, "phase": 0.0})
+    assert settings.run.duration_s is not None
+    found = simulate(settings, round(settings.run.duration_s / settings.bus.cycle_s))
+    table = pa.Table.from_batches([record_batch(found.rows, ["mean_force"])])
+    return table, judged(table, settings, found.units)
+
+
+def test_summary_has_what_is_in_force(unknown: tuple[pa.Table, dict[str, Any]]) -> None:
+    table, summary = unknown
+    # The damping follows the mass in force, and yet it is one wall.
+    (judgement,) = summary["strikes"]
+    assert len(np.unique(table["damping"].to_numpy())) > 10
+    assert (summary["cap"], summary["damping_ratio"]) == (0.5, 0.5)
+    assert judgement["stiffness"] == 2000.0
+    mass = judgement["mass_est_kg_m2"]
+    assert mass == pytest.approx(4.2e-4, rel=0.35)
+    assert 0.0 < judgement["mass_spread"] < 0.5
+    assert judgement["stiffness_in_force"] == pytest.approx(0.5 * mass / 1e-6, rel=0.05)
+    assert judgement["stiffness_in_force_least"] <= judgement["stiffness_in_force"]
+
+
+def test_table_of_strikes_fits_a_terminal(unknown: tuple[pa.Table, dict[str, Any]]) -> None:
+    (judgement,) = unknown[1]["strikes"]
+    strikes = [judgement | {"law": "half_sample", "chatter": True, "chatter_frequency_hz": 262.1}]
+    console = Console(width=80, color_system=None)
+    with console.capture() as capture:
+        console.print(_strike_table(strikes))
+    shown = capture.get()
+    assert "…" not in shown
+    assert "yes, 262 Hz" in shown
+    asked, in_force, mass = shown.splitlines()[-1].split()[2:5]
+    assert (asked, in_force) == ("2000", f"{judgement['stiffness_in_force']:.3g}")
+    assert float(mass) == pytest.approx(1e3 * judgement["mass_est_kg_m2"], rel=5e-3)
+
+
+def test_picture_has_mass_and_stiffness_in_force(
+    unknown: tuple[pa.Table, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table, summary = unknown
+    drawn: list[Figure] = []
+    monkeypatch.setattr(
+        FigureCanvasAgg, "print_png", lambda self, *args, **options: drawn.append(self.figure)
+    )
+    draw_run(tmp_path / "run.png", table, summary["strikes"])
+    axes = {one.get_ylabel(): one for one in drawn[0].get_axes()}
+    asked, in_force = (line.get_ydata() for line in axes["K [N·m/rad]"].lines)
+    assert np.array_equal(np.asarray(asked), table["stiffness"].to_numpy())
+    assert np.array_equal(np.asarray(in_force), table["stiffness_in_force"].to_numpy())
+    (mass,) = axes["mass [g·m²]"].lines
+    assert np.array_equal(np.asarray(mass.get_ydata()), 1e3 * table["mass_est"].to_numpy())

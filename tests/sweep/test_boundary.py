@@ -133,7 +133,7 @@ def lasts(dataset: xr.Dataset) -> bool:
     return bool((more | (dataset["trip"] != 0)).any())
 
 
-@pytest.mark.parametrize("operator", ["none", "finger", "hand"])
+@pytest.mark.parametrize("operator", ["none", "finger", "arm"])
 @pytest.mark.parametrize("coulomb", [0.001, 0.01])
 def test_what_is_passive_with_a_quantised_position_comes_to_rest(
     operator: str, coulomb: float
@@ -158,7 +158,7 @@ def test_what_is_passive_with_a_quantised_position_comes_to_rest(
     assert not lasts(dataset)
 
 
-@pytest.mark.parametrize("operator", ["none", "finger", "hand"])
+@pytest.mark.parametrize("operator", ["none", "finger", "arm"])
 @pytest.mark.parametrize("delay", [0, 1])
 def test_what_is_passive_by_its_damping_comes_to_rest(operator: str, delay: int) -> None:
     viscous, coulomb = 0.02, 0.01

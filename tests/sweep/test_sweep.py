@@ -43,7 +43,7 @@ def raw(plan: Plan) -> list[bytes]:
 @pytest.mark.parametrize(
     "axes",
     [
-        {"law": ["standard", "mean_force"], "operator": ["none", "finger", "hand"]},
+        {"law": ["standard", "mean_force"], "operator": ["none", "finger", "arm"]},
         {"rate": [100, 550, 1000], "law": "mean_force"},
         {"delay": [0, 0.5, 1, 1.6, 2], "law": "half_sample"},
         {"counts": [4096, 1 << 20]},
@@ -141,16 +141,37 @@ def test_a_buzz_within_six_counts_is_felt() -> None:
     assert 200.0 < buzzing["frequency"] < 350.0
 
 
+def test_referent_is_the_wall_in_force_for_the_mass_that_moves() -> None:
+    """A wrong mass in the model is no excuse: it shows in mass_est and stiffness_in_force."""
+    mass, asked = 1e-4 + 0.05 * 0.08**2, 600.0
+    struck: dict[str, object] = {"operator": ["grip"], "law": ["mean_force"]}
+    wall = {"wall.damping_ratio": [0.5], "wall.cap": [0.5]}
+    capped = plan_of(**struck, **wall, stiffness=[asked], model=["drive"])
+    found = compute_piece(capped, 0)[0, 0]
+    stiffness = 0.5 * mass / 1e-6
+    plain = plan_of(**struck, stiffness=[stiffness], damping=[np.sqrt(stiffness * mass)])
+    referent = compute_piece(plain, 0)[0, 0]
+    for name in ("referent_first_depth", "referent_ripple", "referent_events"):
+        assert found[name] == pytest.approx(referent[name], rel=1e-9), name
+    # Half of m/T² of a model that knows the drive alone.
+    assert found["mass_est"] == pytest.approx(1e-4)
+    assert found["stiffness_in_force"] == found["stiffness_in_force_least"]
+    assert found["stiffness_in_force"] == pytest.approx(50.0)
+    assert referent["stiffness_in_force"] == pytest.approx(stiffness)
+
+
 @pytest.mark.parametrize(
     ("axis", "values"),
     [
         ("simulation.current_bandwidth_hz", [800.0, 1600.0]),
         ("simulation.viscous_nm_s_per_rad", [1e-4, 1e-3]),
+        ("friction", [0.0, 0.02]),
+        ("servo", ["1600Hz", "800Hz"]),
         ("press_torque", [0.1, 0.2]),
         ("sync_jitter", [0.0, 1e-4]),
     ],
 )
-def test_numbers_of_plant_and_strike_are_axes(axis: str, values: list[float]) -> None:
+def test_numbers_of_plant_and_strike_are_axes(axis: str, values: list[object]) -> None:
     plan = plan_of(stiffness=[20.0], **{axis: values})
     one, other = (compute_piece(plan, piece)[0, 0] for piece in range(2))
     assert one["penetration"] != other["penetration"]
@@ -170,7 +191,7 @@ def stop_after(count: int) -> Any:
 
 @pytest.mark.slow
 def test_an_interrupted_sweep_goes_on(tmp_path: Path) -> None:
-    plan = plan_of(stiffness="1:100:40", operator=["none", "finger", "grip", "hand"])
+    plan = plan_of(stiffness="1:100:40", operator=["none", "finger", "grip", "arm"])
     whole = sweep(plan, tmp_path / "whole.nc")
     output = tmp_path / "parts.nc"
     with pytest.raises(StoppedError):
@@ -178,7 +199,7 @@ def test_an_interrupted_sweep_goes_on(tmp_path: Path) -> None:
     assert not output.exists()
     with pytest.raises(InputError, match="holds an unfinished sweep; --resume continues"):
         sweep(plan, output)
-    other = plan_of(stiffness="1:100:41", operator=["none", "finger", "grip", "hand"])
+    other = plan_of(stiffness="1:100:41", operator=["none", "finger", "grip", "arm"])
     with pytest.raises(InputError, match="another configuration or other axes"):
         sweep(other, output, resume=True)
     said: list[int] = []
@@ -433,7 +454,7 @@ def test_a_worker_that_dies_is_one_line(tmp_path: Path) -> None:
         ({"stiffness": "1:2:0"}, "is not a range; write LO:HI:N"),
         ({"stiffness": "1,1"}, "axis stiffness: has a value twice"),
         ({"stiffness": ""}, "axis stiffness: has no values"),
-        ({"operator": "giant"}, "has to be one of none, finger, grip, hand, not 'giant'"),
+        ({"operator": "giant"}, "has to be one of none, fingertip, finger, grip, hand, arm, not"),
         ({"model": "none"}, "has to be one of matched, drive, file, not 'none'"),
         ({"rate": "0"}, "axis rate: has to be greater than 0"),
         ({"simulation.coulomb": "1"}, "simulation.coulomb: unknown key; did you mean"),
@@ -442,6 +463,8 @@ def test_a_worker_that_dies_is_one_line(tmp_path: Path) -> None:
         ({"nothing.at_all": "1"}, "nothing.at_all: there is no"),
         ({"law": "none"}, "wall.law: unknown law 'none'"),
         ({"wall.stiffness_nm_per_rad": "1"}, "use stiffness instead"),
+        ({"delay_error": "-1.5"}, "axis delay_error: -1.5 makes D = -0.5; it has to be between"),
+        ({"friction": "-0.01"}, "axis friction: has to be at least 0"),
         ({"delay": "3.5"}, "axis delay: has to be at most 3"),
         ({"damping": "-1"}, "axis damping: has to be at least 0, not -1"),
         ({"rate": "1e8"}, "a strike of .* cycles; 2000000 at most"),
@@ -562,6 +585,10 @@ def test_a_map_is_shown_in_a_table() -> None:
             "energy_out": (
                 ("law", "damping", "stiffness", "speed", "phase"),
                 np.zeros((2, 2, 3, 1, 1)),
+            ),
+            "stiffness_in_force": (
+                ("law", "damping", "stiffness", "speed", "phase"),
+                np.tile(np.array([[[1.0]], [[2.0]], [[3.0]]]), (2, 2, 1, 1, 1)),
             ),
         },
         {"law": ["a", "b"], "damping": [0.0, 1.0], "stiffness": [1.0, 2.0, 3.0]},

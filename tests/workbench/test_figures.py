@@ -33,6 +33,7 @@ NAMES = [
     *(f"figure_5_{n:02}" for n in (3, 4, 8, 9, 10, 11, 12, 14, 16, 17, 18, 19)),
     "all_laws",
     "effective_impedance",
+    "unknown_hands",
     "diolaiti_plane",
 ]
 

@@ -1,0 +1,371 @@
+"""Tables of what laws reach on a servo in unknown hands: plans with fixed axes, and Markdown.
+
+There is one configuration for all operators. Laws with a model know the drive and the delay of its
+loop; `[operator]` says if they find the operator, `[wall]` which damping ratio their referent has.
+Laws that use the sampled position alone have none of that.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from canwall.config import Settings
+from canwall.cycle import named_law
+from canwall.errors import InputError
+from canwall.sweep.axes import STRIKES
+from canwall.sweep.dataset import assemble_dataset
+from canwall.sweep.plan import Plan, make_plan
+from canwall.sweep.strike import OPERATORS, SERVOS
+from canwall.sweep.workers import compute_pieces
+from canwall.walls import LAWS
+
+#: Laws with a damper: a table has them at the damping B·T/m with the largest K-limit.
+DAMPED = ("damped", "thresholded_damper", "unidirectional_damper", "offset_damper")
+#: Laws that use the sampled position alone.
+SAMPLED = ("standard", "hysteresis", "exponential", "energy_bounding", "virtual_coupling", *DAMPED)
+DAMPINGS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
+#: A rigid stop has no stiffness to find a limit of.
+_WITH_STIFFNESS = tuple(name for name in LAWS if name != "rigid")
+
+#: Conditions of the tables: friction [N·m], error of the laws' delay [periods].
+FRICTIONS = (0.0, 0.02)
+DELAY_ERRORS = (-0.3, 0.0, 0.15)
+_FRICTION = 0.01
+#: Strikes: mean speeds of approach [rad/s], which are up to 1.5 times as high at the wall, phases
+#: against the SYNC, and time of the press [s], in which slow estimates of force settle as well.
+_SPEEDS, _PHASES = (0.3, 0.8, 2.0), (0.0, 0.35, 0.7)
+_PRESS_S = 1.2
+#: With the cap: c, and the walls that are asked for [N·m/rad].
+CAPS = (0.5, 1.0)
+_ASKED = tuple(np.geomspace(30.0, 5000.0, 12).round(1).tolist())
+#: First strikes: the wall [N·m/rad], the speeds of approach [rad/s], and the phases.
+_FIRST_STIFFNESS = 200.0
+_FIRST_SPEEDS = (0.3, 0.5, 0.7, 1.0)
+_FIRST_PHASES = tuple(round(n / 6.0, 3) for n in range(6))
+#: Resonances of the shafts [Hz].
+_SHAFTS = (400.0, 250.0)
+
+_LIMITS = ("worst", "worst_normalised", "open_ended")
+
+
+@dataclass(frozen=True)
+class LawTable:
+    """One table.
+
+    Attributes:
+        title: Its title.
+        laws: Its laws unless others are asked for; empty: that of the configuration.
+        axes: Axes besides those of every table, by name.
+        searches: True if its cells are K-limits.
+        capped: True if `wall.cap` stays in force.
+        write: Writes the result as Markdown, line by line.
+    """
+
+    title: str
+    laws: tuple[str, ...]
+    axes: dict[str, Sequence[float | str]]
+    searches: bool
+    capped: bool
+    write: Callable[[xr.Dataset], Iterator[str]]
+
+
+def compute_law_table(
+    name: str,
+    base: Settings,
+    laws: Sequence[str] = (),
+    operators: Sequence[str] = tuple(OPERATORS),
+    through: str = "sim",
+    workers: int | None = None,
+    dask: str | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> xr.Dataset:
+    """Compute a table.
+
+    Args:
+        name: Name in LAW_TABLES.
+        base: Configuration of drive and wall; the table has its own axes, `[sweep]` is ignored.
+        laws: Names of the laws; without: those of the table. Where the table searches K-limits,
+            "standard" and "damped" are added, for comparison.
+        operators: Names of OPERATORS.
+        through: As for `make_plan`.
+        workers: As for `sweep`.
+        dask: As for `sweep`.
+        progress: Called with the pieces of work done and their total.
+
+    Returns:
+        The measures that the table shows, with a dimension per axis. K-limits are at the best of
+        DAMPINGS, which is the coordinate `damping_normalised`.
+
+    Raises:
+        InputError: For a table, a law or an operator that does not exist.
+    """
+    if name not in LAW_TABLES:
+        raise InputError(f"--table {name}: has to be one of {', '.join(LAW_TABLES)}")
+    table = LAW_TABLES[name]
+    base = base.model_copy(update={"sweep": {}})
+    chosen = list(laws or table.laws or (named_law(base),))
+    if table.searches:
+        chosen = list(dict.fromkeys(["standard", "damped", *chosen]))
+    plans = _make_plans(table, base, chosen, operators, through)
+    done, total = 0, sum(plan.pieces for plan in plans)
+    found = []
+    for plan in plans:
+        pieces = {}
+        progress(done, total)
+        for number, piece in compute_pieces(plan, range(plan.pieces), workers, dask):
+            pieces[number] = piece
+            done += 1
+            progress(done, total)
+        dataset = assemble_dataset(plan, pieces)
+        found.append(_limits_of(dataset, table) if table.searches else dataset)
+    joined = xr.concat(found, "law", join="outer").sel(law=chosen) if table.searches else found[0]
+    return joined.assign_attrs(found[0].attrs | {"title": table.title, "table": name})
+
+
+def format_law_table(dataset: xr.Dataset) -> str:
+    """Format the result of `compute_law_table` as Markdown."""
+    return "\n".join(LAW_TABLES[dataset.attrs["table"]].write(dataset))
+
+
+def _make_plans(
+    table: LawTable, base: Settings, laws: Sequence[str], operators: Sequence[str], through: str
+) -> list[Plan]:
+    """Return a plan for the laws with a model, for the sampled ones, and for those with a damper.
+
+    The last two know nothing of the delay, nor of the operator.
+    """
+    shared: dict[str, Sequence[float | str]] = {
+        "operator": operators,
+        "model": ["drive"],
+        "speed": _SPEEDS,
+        "phase": _PHASES,
+        "press": [_PRESS_S],
+        **table.axes,
+    }
+    if not table.capped:
+        base = base.model_copy(update={"wall": base.wall.model_copy(update={"cap": None})})
+    if not table.searches:
+        return [make_plan(base, {"law": laws, **shared}, through)]
+    plain = {"damping_ratio": None, "damping_nm_s_per_rad": 0.0}
+    unknowing = base.model_copy(
+        update={
+            "wall": base.wall.model_copy(update=plain),
+            "operator": base.operator.model_copy(update={"adapt": False}),
+        }
+    )
+    once = shared | ({"delay_error": [0.0]} if "delay_error" in shared else {})
+    plans = []
+    for settings, axes, dampings, some in (
+        (base, shared, (0.0,), [law for law in laws if law not in SAMPLED]),
+        (unknowing, once, (0.0,), [law for law in laws if law in SAMPLED and law not in DAMPED]),
+        (unknowing, once, DAMPINGS, [law for law in laws if law in DAMPED]),
+    ):
+        if some:
+            axes = {"law": some, "damping_normalised": dampings, **axes}
+            plans.append(make_plan(settings, axes, through))
+    return plans
+
+
+def _limits_of(dataset: xr.Dataset, table: LawTable) -> xr.Dataset:
+    """Return the K-limits at the best damping, over all axes of the table."""
+    limits = dataset[list(_LIMITS)].assign(open_ended=dataset["open_ended"].all(STRIKES))
+    limits = limits.drop_vars([*STRIKES], errors="ignore").squeeze(("model", "press"), drop=True)
+    best = limits["worst_normalised"].argmax("damping_normalised")
+    limits = limits.isel(damping_normalised=best)
+    errors = table.axes.get("delay_error", ())
+    if errors and limits.sizes["delay_error"] < len(errors):
+        limits = limits.squeeze("delay_error", drop=True)
+        limits = limits.expand_dims(delay_error=list(errors)).copy()
+    return limits
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}"
+
+
+def _head(names: Sequence[str]) -> Iterator[str]:
+    yield "| | " + " | ".join(names) + " |"
+    yield "|---|" + "---|" * len(names)
+
+
+def _row(name: str, cells: Sequence[str]) -> str:
+    return f"| {name} | " + " | ".join(cells) + " |"
+
+
+def _names(dataset: xr.Dataset, axis: str) -> list[str]:
+    return [str(name) for name in dataset[axis].values]
+
+
+def _limit(at: xr.Dataset) -> str:
+    """Return K·T²/m and K, with the damping B·T/m of a law that has one."""
+    least = "≥ " if at["open_ended"].item() else ""
+    damping = at["damping_normalised"].item()
+    with_damping = f" at {damping:g}" if damping > 0.0 else ""
+    return (
+        f"{least}**{_number(at['worst_normalised'].item())}**{with_damping}; "
+        f"{_number(at['worst'].item())}"
+    )
+
+
+def _servo_name(name: str) -> str:
+    servo = SERVOS[name]
+    return f"{servo.current_bandwidth_hz:g} Hz + {1e3 * servo.drive_cycle_s:g} ms"
+
+
+def format_worst(limits: xr.Dataset) -> str:
+    """Format the worst K·T²/m of all conditions of the table "laws", as Markdown."""
+    return "\n".join(_write_worst(limits))
+
+
+def _write_worst(dataset: xr.Dataset) -> Iterator[str]:
+    operators = _names(dataset, "operator")
+    conditions = ("servo", "friction", "delay_error")
+    normalised = dataset["worst_normalised"].min(conditions)
+    stiffness = dataset["worst"].min(conditions)
+    damped = normalised.sel(law="damped")
+    yield from _head([*operators, "÷ damped"])
+    for law in _names(dataset, "law"):
+        cells = [
+            f"**{_number(normalised.sel(law=law, operator=o).item())}**; "
+            f"{_number(stiffness.sel(law=law, operator=o).item())}"
+            for o in operators
+        ]
+        ratio = (normalised.sel(law=law) / damped.where(damped > 0.0)).min().item()
+        yield _row(law, [*cells, "—" if np.isnan(ratio) else f"≥ {_number(ratio)}×"])
+
+
+def _write_laws(dataset: xr.Dataset) -> Iterator[str]:
+    """Yield the worst of all conditions, then a table per servo and friction."""
+    operators, laws = _names(dataset, "operator"), _names(dataset, "law")
+    normalised = dataset["worst_normalised"]
+    yield "The worst of all servos, frictions and errors of the delay:"
+    yield ""
+    yield from _write_worst(dataset)
+    for servo in _names(dataset, "servo"):
+        for friction in dataset["friction"].values.tolist():
+            yield ""
+            yield f"{_servo_name(servo)}, friction {friction:g} N·m, delay known:"
+            yield ""
+            yield from _head(operators)
+            there = dataset.sel(servo=servo, friction=friction)
+            for law in laws:
+                known = there.sel(law=law, delay_error=0.0)
+                yield _row(law, [_limit(known.sel(operator=o)) for o in operators])
+    errors = [e for e in dataset["delay_error"].values.tolist() if e != 0.0]
+    of_model = [law for law in laws if law not in SAMPLED]
+    for error in errors if of_model else []:
+        yield ""
+        yield f"Delay of the model off by {error:+g} T, K·T²/m, the worst of all frictions:"
+        yield ""
+        yield from _head(operators)
+        off = normalised.sel(delay_error=error).min("friction")
+        for law in of_model:
+            for servo in _names(dataset, "servo"):
+                found = [off.sel(law=law, servo=servo, operator=o) for o in operators]
+                cells = [_number(value.item()) for value in found]
+                yield _row(f"{law}, {_servo_name(servo)}", cells)
+
+
+def _write_cap(dataset: xr.Dataset) -> Iterator[str]:
+    """Yield failed strikes by criterion, and stiffness in force over min(K, m/T²), for each cap."""
+    operators = _names(dataset, "operator")
+    most = np.minimum(dataset["stiffness"], dataset["inertia"] / dataset["period"] ** 2)
+    share = dataset["stiffness_in_force"] / most
+    yield from _head(operators)
+    for law in _names(dataset, "law"):
+        for cap in dataset["wall.cap"].values.tolist():
+            some = {"law": law, "wall.cap": cap}
+            for criterion, name in (
+                ("chatters", f"{law}, cap {cap:g}: failed strikes"),
+                ("chatters_ripple", "with a felt ripple"),
+                ("chatters_amplitude", "with motion about the settled contact"),
+                ("chatters_counts", "with more makes and breaks"),
+            ):
+                of_kind = dataset[criterion].sel(some)
+                each = [of_kind.sel(operator=operator) for operator in operators]
+                yield _row(name, [f"{int(these.sum())} of {these.size}" for these in each])
+            for description, quantile in (("least", 0.0), ("median", 0.5)):
+                values = [
+                    float(np.nanquantile(share.sel(some).sel(operator=o), quantile))
+                    for o in operators
+                ]
+                name = f"{description} K in force ÷ min(K, m/T²)"
+                yield _row(name, [_number(value) for value in values])
+
+
+def _write_first_strikes(dataset: xr.Dataset) -> Iterator[str]:
+    """Yield depth over the referent's, and the fastest exit over the speed of approach."""
+    operators = _names(dataset, "operator")
+    ratio = dataset["first_depth"] / dataset["referent_first_depth"]
+    yield from _head(operators)
+    for law in _names(dataset, "law"):
+        for name, values, quantile in (
+            ("deepest, 95 % of strikes", ratio, 0.95),
+            ("deepest", ratio, 1.0),
+            ("fastest exit", dataset["restitution"], 1.0),
+        ):
+            of_law = values.sel(law=law)
+            cells = [_quantile(of_law.sel(operator=o), quantile) for o in operators]
+            yield _row(f"{law}: {name}", cells)
+
+
+def _quantile(values: xr.DataArray, quantile: float) -> str:
+    known = values.values[np.isfinite(values.values)]
+    return _number(float(np.quantile(known, quantile))) if known.size else "–"
+
+
+def _write_shafts(dataset: xr.Dataset) -> Iterator[str]:
+    """Yield the K-limits on each shaft."""
+    operators = _names(dataset, "operator")
+    for shaft in dataset["simulation.shaft_hz"].values.tolist():
+        yield f"Shaft of {shaft:g} Hz:"
+        yield ""
+        yield from _head(operators)
+        there = dataset.sel({"simulation.shaft_hz": shaft}).squeeze(("servo", "friction"))
+        for law in _names(dataset, "law"):
+            yield _row(law, [_limit(there.sel(law=law, operator=o)) for o in operators])
+        yield ""
+
+
+_SERVOS_AND_FRICTIONS: dict[str, Sequence[float | str]] = {
+    "servo": tuple(SERVOS),
+    "friction": FRICTIONS,
+}
+LAW_TABLES = {
+    "laws": LawTable(
+        "K-limits of the laws in unknown hands",
+        _WITH_STIFFNESS,
+        _SERVOS_AND_FRICTIONS | {"delay_error": DELAY_ERRORS},
+        True,
+        False,
+        _write_laws,
+    ),
+    "cap": LawTable(
+        "Walls with a cap in unknown hands",
+        (),
+        _SERVOS_AND_FRICTIONS
+        | {"delay_error": DELAY_ERRORS, "wall.cap": CAPS, "stiffness": _ASKED},
+        False,
+        True,
+        _write_cap,
+    ),
+    "first-strike": LawTable(
+        "First strike of an unknown hand",
+        (),
+        _SERVOS_AND_FRICTIONS
+        | {"stiffness": (_FIRST_STIFFNESS,), "speed": _FIRST_SPEEDS, "phase": _FIRST_PHASES},
+        False,
+        False,
+        _write_first_strikes,
+    ),
+    "shaft": LawTable(
+        "K-limits on an elastic shaft",
+        ("standard", "damped", "half_sample", "mean_force"),
+        {"servo": ("1600Hz",), "friction": (_FRICTION,), "simulation.shaft_hz": _SHAFTS},
+        True,
+        False,
+        _write_shafts,
+    ),
+}
