@@ -1,14 +1,28 @@
-"""KT²/m of the laws in unknown hands, and strikes with the cap, on the plant written apart.
+"""KT²/m of the laws in unknown hands, first strikes, changes of grip, on the plant written apart.
 
 `python tests/independent/figures.py [SERVO] [COULOMB]`: SERVO "1600" or "800", see `plant.SERVOS`.
 """
 
 import math
 import sys
+from itertools import permutations
 from typing import Any
 
 import numpy as np
-from plant import OPERATORS, SERVOS, STRIKES, Bench, Servo, first_strike, judge, k_limit
+from plant import (
+    FORCES,
+    OPERATORS,
+    SERVOS,
+    STRIKES,
+    Bench,
+    Operator,
+    Servo,
+    Strike,
+    first_strike,
+    judge,
+    k_limit,
+)
+from scipy.signal import butter, sosfilt
 
 #: The laws' model of the drive with its handle; the delay is the true one.
 _DRIVE = {
@@ -76,6 +90,43 @@ def with_cap(servo: Servo, cap: float, seconds: float = 1.2) -> list[tuple[int, 
     return found
 
 
+def first_strikes(
+    bench: Bench, hand: Operator, stiffness: float, count: int
+) -> tuple[list[float], list[float]]:
+    """Return depths over the damped referent's, and speeds out over in, of seeded strikes."""
+    mass = bench.servo.mass + hand.mass
+    rng = np.random.default_rng(1)
+    depths, exits = [], []
+    for _ in range(count):
+        strike = Strike(math.exp(rng.uniform(math.log(0.3), 0.0)), rng.random(), rng.random())
+        s = bench.strike(hand, strike, stiffness, referent_damping=math.sqrt(stiffness * mass))
+        depth, speed_out = first_strike(s)
+        depths.append(depth)
+        exits.append(speed_out)
+    return depths, exits
+
+
+def after_change(bench: Bench, before: Operator, later: Operator) -> tuple[float, float]:
+    """Return the time after a change of grip until the force is quiet [s], and its burst [N].
+
+    The mass and the damping of the hand change in contact. Quiet is a felt ripple below 0.3 N
+    r.m.s. over 20 ms.
+    """
+    change_s = 0.4
+    longest = burst = 0.0
+    for strike in STRIKES[::2]:
+        s = bench.strike(before, strike._replace(change_s=change_s), 200.0, later=later)
+        rate = FORCES / s.period
+        band = butter(2, (20.0, 500.0), "bandpass", fs=rate, output="sos")
+        felt = sosfilt(band, s.hand - s.hand[0])[round(change_s * rate) :]
+        window = round(0.02 * rate)
+        power = np.convolve(felt**2, np.full(window, 1.0 / window), "same")
+        loud = np.flatnonzero(power > 0.3**2)
+        longest = max(longest, (loud[-1] + 1) / rate if len(loud) else 0.0)
+        burst = max(burst, float(np.max(np.abs(felt))))
+    return longest, burst
+
+
 def main() -> None:
     name = sys.argv[1] if len(sys.argv) > 1 else "1600"
     servo = SERVOS[name]
@@ -85,13 +136,22 @@ def main() -> None:
     print("  ", *OPERATORS, sep="  ")
     for law, found in limits(servo).items():
         print(f"{law}:", "  ".join(f"{passed:.3g}" for passed, _ in found), flush=True)
-    for cap in (0.5, 1.0):
-        for hand, (failed, strikes, fastest, least) in zip(
-            OPERATORS, with_cap(servo, cap), strict=True
-        ):
+    for cap in (0.5, 0.8, 1.0):
+        for who, found in zip(OPERATORS, with_cap(servo, cap), strict=True):
+            failed, strikes, fastest, least = found
             print(
-                f"cap {cap:g} {hand}: {failed}/{strikes} failed, exit {fastest:.2f}, K {least:.2f}"
+                f"cap {cap:g} {who}: {failed}/{strikes} failed, exit {fastest:.2f}, K {least:.2f}"
             )
+    bench = Bench(unknown_hand(servo), servo, 0.5)
+    for name, hand in OPERATORS.items():
+        depths, exits = first_strikes(bench, hand, 200.0, 48)
+        deep = np.quantile(depths, 0.95)
+        print(f"first strike, K 200 {name}: depth {deep:.2f} (95 %), exit {max(exits):.2f}")
+    bench = Bench(unknown_hand(servo, **{"wall.cap": 0.8}), servo)
+    hands = {name: hand for name, hand in OPERATORS.items() if hand.mass > 0.0}
+    for (name, hand), (other, later) in permutations(hands.items(), 2):
+        quiet_s, burst = after_change(bench, hand, later)
+        print(f"{name} to {other}: quiet after {1e3 * quiet_s:.0f} ms, burst {burst:.1f} N")
 
 
 if __name__ == "__main__":
