@@ -78,15 +78,16 @@ def _area(end: Array) -> Array:
 def _best_delay(moments: Array, weights: list[Array]) -> tuple[float, float]:
     """Return the delay whose torques explain the most, and the share that they explain.
 
-    It lies between the compared ones, by a parabola.
+    It lies between the compared ones, by a parabola; at their ends there is none, which explains
+    nothing.
     """
     explained = np.array([_explained(moments, each) for each in weights])
-    k = int(np.clip(np.argmax(explained), 1, len(_DELAYS) - 2))
+    k = int(np.argmax(explained))
+    if k in (0, len(_DELAYS) - 1):
+        return float(_DELAYS[k]), 0.0
     before, best, after = explained[k - 1 : k + 2]
-    curvature = before - 2.0 * best + after
-    shift = 0.0 if curvature >= 0.0 else 0.5 * (before - after) / curvature
-    delay = _DELAYS[k] + np.clip(shift, -1.0, 1.0) * (_DELAYS[1] - _DELAYS[0])
-    return float(delay), float(explained.max() / max(moments[0, 0], np.finfo(float).tiny))
+    shift = 0.5 * (before - after) / (before - 2.0 * best + after)
+    return float(_DELAYS[k] + shift * (_DELAYS[1] - _DELAYS[0])), float(best / moments[0, 0])
 
 
 def _explained(moments: Array, weights: Array) -> float:
