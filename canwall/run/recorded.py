@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 #: Torque step [N·m] where the rows have no torque to tell it from, and so nothing depends on it.
 _NO_TORQUE_STEP_NM = 1e-6
+#: Larger numbers are in no run, whatever their unit.
+_LARGEST = 1e12
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,8 @@ def read_run(folder: RunFolder, columns: Collection[str] = ("j",)) -> RunRecord:
         columns: Columns that the caller requires, see `read_signals`.
 
     Raises:
-        ConfigError: If the folder holds no record, or summary.json is something else.
+        ConfigError: If the folder holds no record, rows that are damaged, or something else as
+            summary.json.
         RecordError: If the folder cannot be completed.
     """
     being_written = folder.is_being_written  # asked first: it may end meanwhile
@@ -59,6 +62,9 @@ def read_run(folder: RunFolder, columns: Collection[str] = ("j",)) -> RunRecord:
     signals = read_signals(folder.signals, ROW.names or ())
     if signals.num_rows == 0:
         raise ConfigError(f"{folder.path}: no cycle was recorded")
+    for name in columns:  # a stream has no checksums
+        if not np.all(np.abs(numbers(signals, name)) < _LARGEST):
+            raise ConfigError(f"{folder.signals}: column {name} has values of no run: damaged")
     summary = _summary_from_rows(folder, signals)
     if being_written:
         return RunRecord(

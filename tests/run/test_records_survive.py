@@ -29,6 +29,7 @@ from canwall import config
 from canwall.config import ConfigError
 from canwall.record import RunFolder, read_signals
 from canwall.record.folder import stream_of
+from canwall.record.pictures import DRAWN
 from canwall.run import read_run
 
 #: A hand that stays on the wall of an embedded drive.
@@ -184,6 +185,23 @@ def test_damaged_rows_are_not_read_as_data(four_strikes: Record, tmp_path: Path)
         except ConfigError:
             found += 1
     assert found > 50
+
+
+@pytest.mark.parametrize("value", [np.inf, np.nan, -1e300])
+def test_damaged_rows_of_a_stream_are_no_run(
+    four_strikes: Record, tmp_path: Path, value: float
+) -> None:
+    """A stream of rows, of a run that was cut off, has no checksums."""
+    folder = copy_of(four_strikes.folder, tmp_path / "run", "config.toml")
+    y = four_strikes.column("y").copy()
+    y[70] = value
+    column = four_strikes.signals.column_names.index("y")
+    damaged = four_strikes.signals.set_column(column, "y", pa.array(y))
+    with pa.ipc.new_stream(stream_of(folder.signals), damaged.schema) as stream:
+        stream.write_table(damaged)
+    with pytest.raises(ConfigError, match="column y has values of no run: damaged"):
+        read_run(folder, DRAWN)
+    assert not folder.summary.exists()
 
 
 def test_rows_of_another_kind_are_no_record(four_strikes: Record, tmp_path: Path) -> None:
