@@ -204,6 +204,16 @@ def test_damaged_rows_of_a_stream_are_no_run(
     assert not folder.summary.exists()
 
 
+def test_stream_with_a_damaged_name_is_no_record(four_strikes: Record, tmp_path: Path) -> None:
+    folder = copy_of(four_strikes.folder, tmp_path / "run", "config.toml")
+    stream = stream_of(folder.signals)
+    with pa.ipc.new_stream(stream, four_strikes.signals.schema) as file:
+        file.write_table(four_strikes.signals)
+    stream.write_bytes(stream.read_bytes().replace(b"y_est", b"y\xefest"[:5]))
+    with pytest.raises(ConfigError, match="not a record of a run"):
+        read_run(folder)
+
+
 def test_rows_of_another_kind_are_no_record(four_strikes: Record, tmp_path: Path) -> None:
     folder = copy_of(four_strikes.folder, tmp_path / "run", "config.toml")
     signals = four_strikes.signals
