@@ -123,6 +123,8 @@ def _turn(
                     raise AssertionError(f"statusword {statusword:#06x}, {torque} per mille")
                 if name == "SIGSTOP":  # what it still has to say has to be harmless
                     master.send_signal(signal.SIGCONT)
+                    if phase in ("setting up", "enabling"):  # it has lost nothing, and may go on
+                        master.send_signal(signal.SIGTERM)
                     master.wait(PATIENCE_S)
                     torque = witness.read(0x6077)
                     if torque or witness.read(0x6041) & 0x6F == 0x27:
