@@ -62,10 +62,7 @@ def read_run(folder: RunFolder, columns: Collection[str] = ("j",)) -> RunRecord:
     signals = read_signals(folder.signals, ROW.names or ())
     if signals.num_rows == 0:
         raise ConfigError(f"{folder.path}: no cycle was recorded")
-    for name in columns:  # a stream has no checksums
-        if not np.all(np.abs(numbers(signals, name)) < _LARGEST):
-            raise ConfigError(f"{folder.signals}: column {name} has values of no run: damaged")
-    summary = _summary_from_rows(folder, signals)
+    summary = _summary_of_stream(folder, signals, columns)
     if being_written:
         return RunRecord(
             signals, summary, f"{folder.path}: the run is in progress; this is what there is so far"
@@ -73,6 +70,22 @@ def read_run(folder: RunFolder, columns: Collection[str] = ("j",)) -> RunRecord:
     folder.write_trip(signals, summary["trip_cycle"])
     folder.write_summary(summary)
     return RunRecord(signals, summary, _remark(folder, summary))
+
+
+def _summary_of_stream(
+    folder: RunFolder, signals: "pa.Table", columns: Collection[str]
+) -> dict[str, Any]:
+    """Return a summary of rows that may be damaged: a stream has no checksums."""
+    damaged = f"{folder.signals}: damaged"
+    for name in columns:
+        if not np.all(np.abs(numbers(signals, name)) < _LARGEST):
+            raise ConfigError(f"{damaged}: column {name} has values of no run")
+    try:
+        return _summary_from_rows(folder, signals)
+    except ConfigError:
+        raise
+    except (ArithmeticError, LookupError, ValueError) as error:
+        raise ConfigError(f"{damaged}: {error}") from None
 
 
 def _remark(folder: RunFolder, summary: dict[str, Any]) -> str:

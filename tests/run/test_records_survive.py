@@ -187,19 +187,27 @@ def test_damaged_rows_are_not_read_as_data(four_strikes: Record, tmp_path: Path)
     assert found > 50
 
 
-@pytest.mark.parametrize("value", [np.inf, np.nan, -1e300])
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        *(("y", value, "column y has values of no run") for value in (np.inf, np.nan, -1e300)),
+        ("position_rad", -1e30, "counts_per_rev has to be positive"),
+        ("phase", 77, r".*77.* is not a valid Phase"),
+    ],
+)
 def test_damaged_rows_of_a_stream_are_no_run(
-    four_strikes: Record, tmp_path: Path, value: float
+    four_strikes: Record, tmp_path: Path, name: str, value: float, said: str
 ) -> None:
     """A stream of rows, of a run that was cut off, has no checksums."""
     folder = copy_of(four_strikes.folder, tmp_path / "run", "config.toml")
-    y = four_strikes.column("y").copy()
-    y[70] = value
-    column = four_strikes.signals.column_names.index("y")
-    damaged = four_strikes.signals.set_column(column, "y", pa.array(y))
+    values = four_strikes.column(name).copy()
+    values[:] = value
+    column = four_strikes.signals.schema.get_field_index(name)
+    kind = four_strikes.signals.schema.field(name)
+    damaged = four_strikes.signals.set_column(column, kind, pa.array(values, kind.type))
     with pa.ipc.new_stream(stream_of(folder.signals), damaged.schema) as stream:
         stream.write_table(damaged)
-    with pytest.raises(ConfigError, match="column y has values of no run: damaged"):
+    with pytest.raises(ConfigError, match=f"damaged: {said}"):
         read_run(folder, DRAWN)
     assert not folder.summary.exists()
 
