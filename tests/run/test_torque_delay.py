@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import Record, command, config_file
+from commands import Record, command
 from numpy.typing import NDArray
 from rig import settings_with
 from scipy.integrate import solve_ivp
@@ -69,7 +69,12 @@ def test_what_tells_nothing() -> None:
 
 #: The ideal drive of the closed forms, and one that lags.
 DRIVES: dict[str, dict[str, Any]] = {
-    "ideal": {"simulation.ideal": True},
+    "ideal": {
+        "simulation.ideal": True,
+        "drive.current_bandwidth_hz": 0.0,
+        "drive.drive_cycle_s": 0.0,
+        "operator.adapt": False,
+    },
     "servo": {
         "simulation.ideal": False,
         "simulation.current_bandwidth_hz": 1600.0,
@@ -98,22 +103,15 @@ def test_torque_that_is_a_cycle_late_for_good(drive: str, law: str, stiffness: f
             assert found is None or found[0] - found[1] < reckoned + 0.5
 
 
-FAULT = """
-[[simulation.fault]]
-kind = "late"
-can_id = 0x205
-direction = "received"
-at_sync = {at}
-"""
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("at", [None, 20, 1500])
 def test_rpdos_that_are_late_for_good_are_told(tmp_path: Path, at: int | None) -> None:
     """Each takes effect one SYNC later than the laws reckon with."""
-    file = config_file(tmp_path / "c.toml", {'law = "standard" ': 'law = "half_sample" '})
-    text = file.read_text().split("[[schedule]]")[0]
-    file.write_text(text if at is None else text + FAULT.format(at=at))
+    late = {"kind": "late", "can_id": 0x205, "direction": "received", "at_sync": at}
+    faults = {"simulation.fault": [] if at is None else [late]}
+    settings = settings_with({**DRIVES["ideal"], **faults, "wall.law": "half_sample"})
+    file = tmp_path / "c.toml"
+    file.write_text(settings.model_copy(update={"schedule": ()}).to_toml())
     done = command("run", file, "--output", tmp_path / "run")
     assert done.returncode == 0, done.stderr
     told = [line for line in done.stderr.splitlines() if "cycles after their position" in line]
