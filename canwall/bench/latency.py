@@ -28,9 +28,17 @@ from canwall.cycle import (
     real_time_machine,
     run_laws,
 )
+from canwall.drive import DriveError
 from canwall.errors import RunFailedError
 from canwall.record import Ring
-from canwall.run import StopRequest, drive_dictionary, make_axis, make_exchange, on_the_bus
+from canwall.run import (
+    StopRequest,
+    drive_dictionary,
+    make_axis,
+    make_exchange,
+    on_the_bus,
+    restoring_drives,
+)
 
 #: Time before each phase that is not measured: caches fill and the load starts [s].
 _SETTLING_S = 0.3
@@ -115,7 +123,10 @@ class ShortestCycle:
 
 @dataclass(frozen=True)
 class Latency:
-    """Result of a measurement: its conditions, its phases, and the shortest cycle."""
+    """Result of a measurement: its conditions, its phases, and the shortest cycle.
+
+    `not_restored` has a line for each change in the drive that could not be undone.
+    """
 
     interface: str
     channel: str
@@ -127,13 +138,14 @@ class Latency:
     phases: tuple[LatencyPhase, ...]
     budget: Budget
     shortest_cycle: ShortestCycle
-    notes: tuple[str, ...]
+    not_restored: tuple[str, ...]
 
 
 def measurement_settings(settings: Settings) -> Settings:
-    """Return the settings of a measurement: in real time and without a schedule."""
+    """Return the settings of a measurement: in real time, without a schedule, drive put back."""
     bus = settings.bus.model_copy(update={"pace": "real_time"})
-    return settings.model_copy(update={"bus": bus, "schedule": ()})
+    drive = settings.drive.model_copy(update={"restore": True})
+    return settings.model_copy(update={"bus": bus, "drive": drive, "schedule": ()})
 
 
 def measure_latency(
@@ -162,7 +174,7 @@ def measure_latency(
     Raises:
         ConfigError: If the bus cannot be opened.
         DictionaryError: If the object dictionary cannot be used.
-        DriveError: If the drive cannot be set up.
+        DriveError: If the drive cannot be set up; if it was stopped, and cannot be put back.
         RunFailedError: If no TPDO arrives.
         can.CanError: If the bus fails.
     """
@@ -171,12 +183,10 @@ def measure_latency(
     if processes or threads:
         loads["load"] = (processes, threads)
     dictionary, laws = drive_dictionary(settings), run_laws(settings)
-    with on_the_bus(settings) as link:
-        ring = Ring.create()
+    with on_the_bus(settings) as link, closing(Ring.create()) as ring:
         report("setting up the drive, without enabling it")
-        axis = make_axis(link, settings, dictionary, laws, ring)
-        notes: list[str] = []
-        try:
+        with restoring_drives() as (axes, failures):
+            axes.append(axis := make_axis(link, settings, dictionary, laws, ring))
             budget = cycle_budget(axis.node, axis.setup, settings.bus)
             with closing(make_exchange(link, [axis])) as exchange:
                 measurement = _Measurement(axis, exchange, stop, progress)
@@ -190,10 +200,12 @@ def measure_latency(
                     ):
                         phases.append(measurement.phase(name, duration_s))
                     if stop():
-                        return None
-        finally:
-            notes += axis.node.restore()
-            ring.close()
+                        break
+    not_restored = [line for lines in failures.values() for line in lines]
+    if stop():
+        if not_restored:
+            raise DriveError("; ".join(["interrupted", *not_restored]))
+        return None
     bus = settings.bus
     return Latency(
         bus.interface,
@@ -206,7 +218,7 @@ def measure_latency(
         tuple(phases),
         budget,
         shortest_cycle(phases, budget, settings, granted),
-        tuple(notes),
+        tuple(not_restored),
     )
 
 

@@ -8,7 +8,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from canwall.cli.ending import FAILED, StoppedError
+from canwall.cli.ending import FAILED, StoppedError, failed_if
 from canwall.cli.options import (
     ConfigArgument,
     EdsOption,
@@ -16,7 +16,7 @@ from canwall.cli.options import (
     absolute_path,
     settings_from,
 )
-from canwall.cli.output import ProgressDisplay, console, errors, say
+from canwall.cli.output import ProgressDisplay, console, errors
 from canwall.stopping import stop_on_signals
 
 if TYPE_CHECKING:
@@ -95,15 +95,14 @@ def latency(
         )
     if measured is None:
         raise StoppedError("interrupted; the drive is as it was before")
+    failed = failed_if(measured.not_restored)
     for line in report_lines(measured):
         console.print(line, soft_wrap=True, highlight=False, markup=False)
     if output is not None:
         for path in write_latency(measured, output):
             console.print(str(path), soft_wrap=True, highlight=False)
-    for note in measured.notes:
-        say(note)
     console.print(measured.shortest_cycle.text, soft_wrap=True, highlight=False, markup=False)
-    return 0
+    return failed
 
 
 def _print_findings(findings: "Findings") -> None:

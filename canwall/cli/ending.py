@@ -1,7 +1,7 @@
 """End of every command: exit codes, and errors as one line."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import typer
 
@@ -20,27 +20,43 @@ def guarded(command: Callable[[], object]) -> int:
     """Run a command and return its exit code; errors become one line each, a traceback is a bug."""
     try:
         result = command()
-    except StoppedError as interrupted:
-        say(str(interrupted))
-        return INTERRUPTED
-    except (KeyboardInterrupt, typer.Abort):
-        return INTERRUPTED
-    except typer.TyperException as error:
-        if text := error.format_message():  # empty if the help was shown instead
-            say(one_line(text))
-        return BAD_INPUT
-    except InputError as error:
-        say(str(error))
-        return BAD_INPUT
-    except Exception as error:
-        if not isinstance(error, RunFailedError) and not _is_bus_error(error):
-            raise
-        say(str(error))
-        return FAILED
+    except (Exception, KeyboardInterrupt) as error:
+        code = _tell(error)
+        # Notes say what could not be put in order after it.
+        return failed_if(getattr(error, "__notes__", ())) or code
     return result if isinstance(result, int) else 0
 
 
-def _is_bus_error(error: Exception) -> bool:
+def failed_if(troubles: Iterable[str]) -> int:
+    """Print a line for each trouble; return the exit code that they make, 0 without any."""
+    code = 0
+    for trouble in troubles:
+        say(trouble)
+        code = FAILED
+    return code
+
+
+def _tell(error: BaseException) -> int:
+    """Print an error as a line; return its exit code. Raises it again if it is a bug."""
+    if isinstance(error, (KeyboardInterrupt, typer.Abort)):
+        return INTERRUPTED
+    if isinstance(error, StoppedError):
+        say(str(error))
+        return INTERRUPTED
+    if isinstance(error, typer.TyperException):
+        if text := error.format_message():  # empty if the help was shown instead
+            say(one_line(text))
+        return BAD_INPUT
+    if isinstance(error, InputError):
+        say(str(error))
+        return BAD_INPUT
+    if isinstance(error, RunFailedError) or _is_bus_error(error):
+        say(str(error))
+        return FAILED
+    raise error
+
+
+def _is_bus_error(error: BaseException) -> bool:
     """Return True for an error of python-can, without importing it: that takes long."""
     can = sys.modules.get("can")
     return can is not None and isinstance(error, can.CanError)

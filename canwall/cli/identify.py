@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from canwall.cli.ending import FAILED, INTERRUPTED
+from canwall.cli.ending import FAILED, INTERRUPTED, failed_if
 from canwall.cli.options import (
     ConfigArgument,
     EdsOption,
@@ -59,8 +59,10 @@ def identify(
                 console.print(f"\n{fragment}", soft_wrap=True, highlight=False, markup=False)
             write_report(found, settings, inertia)
         console.print(f"record: {result.folder.path}", soft_wrap=True, highlight=False)
-        for remark in (*result.remarks, *result.not_restored, *result.notes):
+        for remark in result.remarks:
             say(remark)
+        if failed_if((*result.not_restored, *result.notes)):
+            return FAILED
         if result.outcome.interrupted or stop():
             return INTERRUPTED
         return 0 if told else FAILED

@@ -9,7 +9,7 @@ import typer
 from rich import box
 from rich.table import Table
 
-from canwall.cli.ending import FAILED, INTERRUPTED
+from canwall.cli.ending import FAILED, INTERRUPTED, failed_if
 from canwall.cli.options import (
     ConfigArgument,
     EdsOption,
@@ -77,6 +77,7 @@ def run(
 
 def _tell(results: "Sequence[RunResult]") -> int:
     """Print what came of the walls; return the exit code."""
+    code = 0
     for result in results:
         console.print(_strike_table(result.summary["strikes"]))
         console.print(f"record: {result.folder.path}", soft_wrap=True, highlight=False)
@@ -84,16 +85,15 @@ def _tell(results: "Sequence[RunResult]") -> int:
             console.print(advice, soft_wrap=True, highlight=False, markup=False)
         for remark in result.remarks:
             say(remark)
-        for note in (*result.not_restored, *result.notes):
-            say(note)
+        code |= failed_if((*result.not_restored, *result.notes))
     outcome = results[0].outcome
     for trip in outcome.trips:
         say(trip)
     if outcome.error is not None:
         raise outcome.error
-    if outcome.trips or any(result.notes or result.not_restored for result in results):
+    if outcome.trips:
         return FAILED
-    return INTERRUPTED if outcome.interrupted else 0
+    return code or (INTERRUPTED if outcome.interrupted else 0)
 
 
 def _run_settings(path: Path, overrides: dict[str, Any]) -> "Settings":

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
-from canwall.cli.ending import INTERRUPTED
+from canwall.cli.ending import INTERRUPTED, failed_if
 from canwall.cli.options import settings_from
 from canwall.cli.output import console
 from canwall.cli.program import make_program
@@ -86,16 +86,18 @@ def _run_session(
 
     paths = [absolute_law(name, Path()) for name in laws or []]
     session = Session(settings, paths, output, seconds, Terminal())
+    code = 0
     try:
         procedure(session)
     except SessionEndedError:
-        return 0
+        pass
     except KeyboardInterrupt:
-        return INTERRUPTED
+        code = INTERRUPTED
     finally:
         # However the session ends, the verdicts so far are what it has found.
         _print_verdicts(session)
-    return 0
+        failed = failed_if(session.troubles)
+    return failed or code
 
 
 def _print_verdicts(session: "Session") -> None:

@@ -97,7 +97,7 @@ def read_signals(path: Path, columns: Collection[str] = ("j",)) -> "pa.Table":
         table.validate(full=True)
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; give the folder of a run") from None
-    except (OSError, pa.ArrowException) as error:
+    except (OSError, UnicodeError, pa.ArrowException) as error:
         raise ConfigError(f"{path}: not a record of a run: {reason(error)}") from None
     missing = [name for name in columns if name not in table.column_names]
     if missing:

@@ -52,19 +52,17 @@ def make_axis(
         ring: Ring for the rows of its cycles.
 
     Raises:
-        DriveError: If the drive cannot be set up.
+        DriveError: If the drive cannot be set up. With `[drive] restore` its changes are undone;
+            notes of the error name those that could not be.
     """
     node = DriveNode(link, settings.drive.node_id, dictionary, settings.drive.sdo_timeout_s)
     try:
         setup = set_up(
             node, settings.drive, settings.bus, settings.limits.torque_nm, settings.real_time
         )
-    except DriveError as error:
-        kept = node.restore() if settings.drive.restore else []
-        raise DriveError("; not restored: ".join([str(error), *kept])) from None
-    except BaseException:
+    except BaseException as error:
         if settings.drive.restore:
-            node.restore()
+            _tell(error, _restored(node))
         raise
     period = settings.bus.cycle_s
     changes = [
@@ -146,17 +144,36 @@ def render(
 def restoring_drives() -> Iterator[tuple[list[WallAxis], dict[str, list[str]]]]:
     """Undo the changes in the drives at the end, for each with `[drive] restore`.
 
-    Yields a list to fill with the axes, and a dictionary that will hold, by name of the axis, the
-    changes that could not be undone.
+    Yields a list to fill with the axes, and a dictionary that will hold, by name of the axis, a
+    line for each change that could not be undone. An error on the way has them as notes; Ctrl-C
+    becomes a DriveError.
     """
     axes: list[WallAxis] = []
     failures: dict[str, list[str]] = {}
     try:
         yield axes, failures
-    finally:
-        for axis in axes:
-            if axis.settings.drive.restore:
-                failures[axis.name] = axis.node.restore()
+    except BaseException as error:
+        failures.update(_restore(axes))
+        _tell(error, [line for lines in failures.values() for line in lines])
+        raise
+    failures.update(_restore(axes))
+
+
+def _restore(axes: Sequence[WallAxis]) -> dict[str, list[str]]:
+    return {axis.name: _restored(axis.node) for axis in axes if axis.settings.drive.restore}
+
+
+def _restored(node: DriveNode) -> list[str]:
+    """Undo the changes in a drive; return a line for each that could not be undone."""
+    return [f"node {node.node_id}: not restored: {failure}" for failure in node.restore()]
+
+
+def _tell(error: BaseException, not_restored: Sequence[str]) -> None:
+    """Add what was not restored to an error as notes; Ctrl-C has none, and becomes an error."""
+    if not_restored and isinstance(error, KeyboardInterrupt):
+        raise DriveError("; ".join(["interrupted", *not_restored])) from None
+    for line in not_restored:
+        error.add_note(line)
 
 
 def _prepared_machine(settings: Settings) -> AbstractContextManager[dict[str, Grant]]:

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 #: Torque step [N·m] where the rows have no torque to tell it from, and so nothing depends on it.
 _NO_TORQUE_STEP_NM = 1e-6
+#: Larger numbers are in no run, whatever their unit.
+_LARGEST = 1e12
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,8 @@ def read_run(folder: RunFolder, columns: Collection[str] = ("j",)) -> RunRecord:
         columns: Columns that the caller requires, see `read_signals`.
 
     Raises:
-        ConfigError: If the folder holds no record, or summary.json is something else.
+        ConfigError: If the folder holds no record, rows that are damaged, or something else as
+            summary.json.
         RecordError: If the folder cannot be completed.
     """
     being_written = folder.is_being_written  # asked first: it may end meanwhile
@@ -59,7 +62,7 @@ def read_run(folder: RunFolder, columns: Collection[str] = ("j",)) -> RunRecord:
     signals = read_signals(folder.signals, ROW.names or ())
     if signals.num_rows == 0:
         raise ConfigError(f"{folder.path}: no cycle was recorded")
-    summary = _summary_from_rows(folder, signals)
+    summary = _summary_of_stream(folder, signals, columns)
     if being_written:
         return RunRecord(
             signals, summary, f"{folder.path}: the run is in progress; this is what there is so far"
@@ -67,6 +70,22 @@ def read_run(folder: RunFolder, columns: Collection[str] = ("j",)) -> RunRecord:
     folder.write_trip(signals, summary["trip_cycle"])
     folder.write_summary(summary)
     return RunRecord(signals, summary, _remark(folder, summary))
+
+
+def _summary_of_stream(
+    folder: RunFolder, signals: "pa.Table", columns: Collection[str]
+) -> dict[str, Any]:
+    """Return a summary of rows that may be damaged: a stream has no checksums."""
+    damaged = f"{folder.signals}: damaged"
+    for name in columns:
+        if not np.all(np.abs(numbers(signals, name)) < _LARGEST):
+            raise ConfigError(f"{damaged}: column {name} has values of no run")
+    try:
+        return _summary_from_rows(folder, signals)
+    except ConfigError:
+        raise
+    except (ArithmeticError, LookupError, ValueError) as error:
+        raise ConfigError(f"{damaged}: {error}") from None
 
 
 def _remark(folder: RunFolder, summary: dict[str, Any]) -> str:

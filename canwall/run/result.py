@@ -3,18 +3,27 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from canwall.analysis import AskedWall
 from canwall.config import ConfigError, Settings
 from canwall.cycle import BusMonitor, Exchange, Outcome, WallAxis, timing_summary
 from canwall.drive import DriveSetup
 from canwall.errors import RunFailedError
-from canwall.record import RecordError, RunFolder, numbers, read_signals
+from canwall.record import Phase, RecordError, RunFolder, numbers, read_signals
 from canwall.record.summary import summarise
 from canwall.run.referent import referent_motion
+from canwall.run.torque_delay import delay_in_record
 from canwall.units import DriveUnits
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+
+#: Delay beyond that of the laws from which on it is told [cycles].
+_LATE_CYCLES = 0.5
+#: Cycles before the end in which the delay is looked for.
+_LATEST = 200_000
 
 
 @dataclass(frozen=True)
@@ -90,7 +99,12 @@ def write_result(
         summary,
         outcome,
         notes,
-        [*remarks, *_remarks_on_lag(axis), *_remarks_on_guard(axis)],
+        [
+            *remarks,
+            *_remarks_on_lag(axis),
+            *_remarks_on_delay(axis, summary["motion_delay_cycles"]),
+            *_remarks_on_guard(axis),
+        ],
         not_restored,
     )
 
@@ -99,7 +113,18 @@ def judged(signals: "pa.Table", settings: Settings, units: DriveUnits) -> dict[s
     """Return what the summary has from the rows, judged against the continuous referent."""
     asked = AskedWall(*(numbers(signals, name) for name in AskedWall._fields))
     referent = referent_motion(settings, asked, numbers(signals, "wall_position_rad"))
-    return summarise(signals, settings, units, *((None, None) if referent is None else referent))
+    found = summarise(signals, settings, units, *((None, None) if referent is None else referent))
+    return found | {"motion_delay_cycles": _delay_of(signals)}
+
+
+def _delay_of(signals: "pa.Table") -> list[float] | None:
+    """Return the delay that the motion on the wall shows in the end, and half of its interval."""
+    signals = signals.slice(max(0, signals.num_rows - _LATEST))
+    received = np.array(signals["received"].to_pylist())
+    on_the_wall = numbers(signals, "phase") == Phase.RENDERING
+    position = np.where(received & on_the_wall, numbers(signals, "position_rad"), np.nan)
+    found = delay_in_record(position, numbers(signals, "torque_cmd"))
+    return None if found is None else list(found)
 
 
 def _remarks_on_lag(axis: WallAxis) -> list[str]:
@@ -109,6 +134,18 @@ def _remarks_on_lag(axis: WallAxis) -> list[str]:
     return [
         f"TPDOs have been late by a cycle since one was missing: the delay is {axis.delay + lag:g} "
         f"cycles, for which the estimator allows; look to the drive's timing and the bus load"
+    ]
+
+
+def _remarks_on_delay(axis: WallAxis, found: list[float] | None) -> list[str]:
+    """Name a delay that is longer than the one of the laws by about a cycle."""
+    reckoned = axis.delay + int(axis.cycle["lag"][0])
+    if found is None or found[0] - found[1] <= reckoned + _LATE_CYCLES:
+        return []
+    return [
+        f"torques take effect {found[0]:.2f} ± {found[1]:.2f} cycles after their "
+        f"position, as the motion shows, where the laws reckon with {reckoned:.2f}: RPDOs reach "
+        f"the drive too late, or it lags; try a longer bus.cycle_s or estimator.measure_delay"
     ]
 
 

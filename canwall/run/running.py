@@ -123,7 +123,7 @@ def run_together(
                 of_axis = [*of_record, *monitor.notes] if axis is axes[0] else of_record
                 remarks = remarks_on(axis.setup, axis.settings)
                 remarks += outcome.notes if axis is axes[0] else []
-                kept = [f"{axis.name}: not restored: {w}" for w in not_restored.get(axis.name, [])]
+                kept = not_restored.get(axis.name, [])
                 results.append(
                     write_result(axis, exchange, monitor, folder, outcome, of_axis, remarks, kept)
                 )
@@ -167,7 +167,10 @@ def _told(outcome: Outcome, error: Exception) -> Exception:
         return error
     named = isinstance(error, (InputError, RunFailedError))
     what = str(error) if named else f"{type(error).__name__}: {error}"
-    return RunFailedError(f"{trips}; then: {what}")
+    told = RunFailedError(f"{trips}; then: {what}")
+    for note in getattr(error, "__notes__", ()):
+        told.add_note(note)
+    return told
 
 
 def _check_together(many: Sequence[Settings]) -> None:

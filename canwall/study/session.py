@@ -74,6 +74,8 @@ class Session:
         self._folder, self._terminal = folder, terminal
         self._steps = 0
         self.verdicts: list[Verdict] = []
+        #: What runs could not put back in the drive, and what their records lack.
+        self.troubles: list[str] = []
         self.table = folder / TABLE
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -145,6 +147,8 @@ class Session:
             settings, self._folder / f"{self._steps:02d}-K{stiffness:.4g}", stopped=stopped
         )
         outcome = result.outcome
+        troubles = (*result.not_restored, *result.notes)
+        self.troubles += [trouble for trouble in troubles if trouble not in self.troubles]
         if not outcome.disabled:
             raise RunFailedError("; ".join(outcome.trips))
         if outcome.interrupted:

@@ -34,7 +34,7 @@ def sweep(
 
     Raises:
         InputError: If the files or the scheduler cannot be used; nothing is computed then.
-        RunFailedError: If the cluster fails.
+        RunFailedError: If the cluster fails, or a law does not return.
     """
     journal = Journal(output, plan_json(plan), resume)
     try:

@@ -14,7 +14,8 @@ from canwall.analysis.k_limit import K_LIMIT, k_limits
 from canwall.analysis.strike import MEASURES
 from canwall.config import Settings
 from canwall.cycle import named_law
-from canwall.errors import InputError
+from canwall.errors import InputError, RunFailedError
+from canwall.supervised import Call
 from canwall.sweep.axes import (
     DAMPING,
     DEFAULTS,
@@ -31,6 +32,8 @@ from canwall.sweep.strike import PreparedStrike
 PieceResult = tuple[int, NDArray[np.void]]
 #: Walls of a map in one piece of work, for which the strike is prepared once.
 _PIECE = 120
+#: Processor time in a single evaluation after which a law counts as one that does not return [s].
+_LAW_S = 0.5
 #: The largest result: 1.5 GB.
 _MOST_POINTS = 10_000_000
 
@@ -188,10 +191,39 @@ def _check_values(plan: Plan) -> None:
 
 
 def compute_piece(plan: Plan, piece: int) -> NDArray[np.void]:
-    """Compute a piece of work; shape (strikes, walls), dtype of the plan."""
+    """Compute a piece of work; shape (strikes, walls), dtype of the plan.
+
+    Raises RunFailedError if a law does not return; the thread that evaluates it is left behind.
+    """
     condition, strikes, walls = plan.slices(piece)
     point = plan.points[condition]
     prepared = [plan.prepare(point, strike) for strike in plan.strikes[strikes]]
+    computed: list[NDArray[np.void]] = []
+    call = Call(
+        lambda: computed.append(_strike(plan, prepared, walls)),
+        lambda: [strike.progress for strike in prepared],
+    )
+    while not call.has_ended():
+        if call.computed_s < _LAW_S:
+            continue
+        for strike, at in zip(prepared, plan.strikes[strikes], strict=True):
+            if evaluating := strike.evaluating:
+                call.give_up()
+                text = f"{evaluating} has not returned for {call.computed_s:.2g} s"
+                raise RunFailedError(_at({**point, **at}, text))
+    if isinstance(call.error, RunFailedError):
+        raise RunFailedError(_at(point, str(call.error)))
+    if call.error is not None:
+        raise call.error
+    return computed[0]
+
+
+def _at(point: Mapping[str, Value], text: str) -> str:
+    """Return the text of an error at a point; its law is in the text."""
+    return ", ".join([*(f"{name} {value}" for name, value in point.items() if name != "law"), text])
+
+
+def _strike(plan: Plan, prepared: Sequence[PreparedStrike], walls: slice) -> NDArray[np.void]:
     mass, period = prepared[0].mass, prepared[0].period
     damping_unit = mass / period if plan.damping.name == "damping_normalised" else 1.0
     if plan.stiffness is None:

@@ -11,8 +11,8 @@ from canwall.analysis.felt import HANDLE_RADIUS_M, FeltBand, felt_band
 from canwall.analysis.strike import MEASURES, measure_strike
 from canwall.compiled import Record, compiled
 from canwall.config import ConfigError, Hand, Mechanics, Settings
-from canwall.cycle import run_laws
-from canwall.errors import InputError
+from canwall.cycle import named_law, run_laws
+from canwall.errors import InputError, RunFailedError
 from canwall.record import ROW, Phase, Ring
 from canwall.run import drive_dictionary, make_axis, make_exchange, on_the_bus, render
 from canwall.run.closed_loop import (
@@ -24,6 +24,7 @@ from canwall.run.closed_loop import (
     simulate_wall,
 )
 from canwall.run.referent import Referent
+from canwall.supervised import given_up
 
 Array = NDArray[np.float64]
 
@@ -245,6 +246,7 @@ class PreparedStrike:
         self._band = felt_band(settings.bus.cycle_s)
         self._radius = settings.mechanics.handle_radius_m or HANDLE_RADIUS_M
         self._by_frames = through == "bus"
+        self.law = named_law(settings)
 
     @property
     def mass(self) -> float:
@@ -266,6 +268,21 @@ class PreparedStrike:
         press = abs(hand.press_torque_nm) + hand.stiffness_nm_per_rad * abs(hand.press_rad - wall)
         way = min(abs(limit - wall) for limit in self._settings.limits.position_rad)
         return press / (_HELD_WITHIN * way)
+
+    @property
+    def progress(self) -> int:
+        """A value that changes as long as a strike in memory gets on."""
+        return int(self._loop.cycle["j"][0])
+
+    @property
+    def evaluating(self) -> str:
+        """Wall and cycle whose law is being evaluated in memory; empty if none is."""
+        cycle = self._loop.cycle[0]
+        if not cycle["evaluated"]:
+            return ""
+        wall = cycle["rendered"][0]["wall"][0]
+        stiffness, damping = float(wall["asked_stiffness"]), float(wall["asked_damping"])
+        return f"{_shown(stiffness, damping)}: cycle {self.progress}: law {self.law}"
 
     def on(self, stiffness: float, damping: float) -> np.void:
         """Strike a wall of this stiffness [N·m/rad] and damping [N·m·s/rad]; dtype MEASURES."""
@@ -338,6 +355,10 @@ class PreparedStrike:
         same = differs[0] if len(differs) else shared
         felt[:same] = again[3, :same]
         return felt
+
+
+def _shown(stiffness: float, damping: float) -> str:
+    return f"stiffness {stiffness:.6g}, damping {damping:.6g}"
 
 
 @compiled
@@ -432,6 +453,9 @@ def signals_over_bus(settings: Settings) -> tuple[Array, int]:
     Returns:
         The signals of `simulate_loop` from the end of enabling on, without the force on the hand,
         shape (SIGNALS - 1, n), and the trip.
+
+    Raises:
+        RunFailedError: If the law does not return.
     """
     # Each thread has a bus: others may strike at the same time.
     channel = f"{settings.bus.channel}-{threading.get_ident()}"
@@ -448,7 +472,13 @@ def signals_over_bus(settings: Settings) -> tuple[Array, int]:
     try:
         with on_the_bus(settings) as link:
             axis = make_axis(link, settings, drive_dictionary(settings), laws, ring)
-            render(make_exchange(link, [axis]), lambda: False, collect)
+            left_behind = len(given_up)
+            outcome = render(make_exchange(link, [axis]), lambda: False, collect)
+            if len(given_up) > left_behind:
+                shown = _shown(
+                    settings.wall.stiffness_nm_per_rad, settings.wall.damping_nm_s_per_rad
+                )
+                raise RunFailedError(f"{shown}: {'; '.join(outcome.trips)}")
         collect(0.0)
     finally:
         ring.close()

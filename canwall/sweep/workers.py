@@ -33,7 +33,7 @@ def compute_pieces(
 
     Raises:
         InputError: If there is no scheduler at the address.
-        RunFailedError: If the cluster fails, or a process dies.
+        RunFailedError: If the cluster fails, a process dies, or a law does not return.
     """
     if dask is not None:
         return compute_on_cluster(plan, pieces, dask)

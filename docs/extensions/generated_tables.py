@@ -246,6 +246,32 @@ class Promises(_Generated):
         yield from _table(("drive", "master", "seen"), rows)
 
 
+_TIMES = Path(__file__).parents[1] / "ways_out.json"
+_WAYS_OUT = {"ctrl_c": "Ctrl-C", "sigterm": "SIGTERM"}
+
+
+class TimesOfWaysOut(_Generated):
+    """What `scripts/bench ways_out` has measured: `{times-of-ways-out}`, from ways_out.json."""
+
+    def lines(self) -> Iterator[str]:
+        """A table of the signals, for each watchdog."""
+        head = (
+            "way out",
+            "last RPDO with torque, ms (longest)",
+            "drive without torque, ms (longest)",
+        )
+        rows = []
+        for way, times in json.loads(_TIMES.read_text())["ways_out"].items():
+            if way == "repeats":
+                continue
+            number, _, watchdog = way.partition(", ")
+            shown = watchdog.replace("_", " ").replace("rpdo", "RPDO")
+            name = _WAYS_OUT.get(way, f"{number.upper()}, {shown}")
+            measured = (times["last_rpdo_with_torque_ms"], times["drive_without_torque_ms"])
+            rows.append((name, *(f"{t['median']:.3g} ({t['longest']:.3g})" for t in measured)))
+        yield from _table(head, rows)
+
+
 def _figure(value: Any) -> str:
     if isinstance(value, list):
         return " to ".join(map(_figure, value))
@@ -259,4 +285,5 @@ def setup(app: "Sphinx") -> dict[str, Any]:
     app.add_directive("recorded-columns", RecordedColumns)
     app.add_directive("sweep-measures", SweepMeasures)
     app.add_directive("promises", Promises)
+    app.add_directive("times-of-ways-out", TimesOfWaysOut)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -16,7 +16,7 @@ from on_the_bus import exchange, simulated_drive, whole_loop
 from on_the_clock import several_drives, sync_jitter
 from on_the_drive import endurance
 from on_the_socket import full_cycles, round_trip, round_trip_on_vcan0, under_python
-from on_the_sweep import closed_loop, sweep_on_two_cores
+from on_the_sweep import closed_loop, safeguards, sweep_on_two_cores
 from ways_out import ways_out
 
 Benchmark: TypeAlias = Callable[[], dict[str, Any]]
@@ -34,6 +34,7 @@ BENCHMARKS: dict[str, Benchmark] = {
     "planning_steps": planning_steps,
     "ball": ball,
     "closed_loop": closed_loop,
+    "safeguards": safeguards,
     "sweep_on_two_cores": sweep_on_two_cores,
 }
 ON_REQUEST: dict[str, Benchmark] = {

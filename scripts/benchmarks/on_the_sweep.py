@@ -1,24 +1,33 @@
 """The sweep in memory: closed-loop periods per second, against plain Python, on two cores."""
 
+import gc
 import os
 import statistics
+import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numba import njit
 
 from canwall import config
-from canwall.record import ROW
-from canwall.run.closed_loop import SIGNALS, ClosedLoop, simulate_wall
+from canwall.cycle import Loop, run_laws, run_loop
+from canwall.record import ROW, Ring
+from canwall.run import drive_dictionary, make_axis, make_exchange, on_the_bus
+from canwall.run.closed_loop import SIGNALS, ClosedLoop, Disturbances, simulate_wall
 from canwall.sweep import make_plan
 from canwall.sweep.plan import Plan
 from canwall.sweep.workers import compute_pieces
 
 #: Periods of one strike.
 _STRIKE = 1000
+#: Turns of a ratio.
+_RATIOS = 15
 
 
 def _plan(**axes: Any) -> Plan:
@@ -51,6 +60,95 @@ def closed_loop() -> dict[str, Any]:
         "plain_python_periods_per_s": round(plain),
         "half_sample_over_plain_python": round(found["half_sample"] / plain, 1),
     }
+
+
+def safeguards() -> dict[str, Any]:
+    """Time of a closed loop with each safeguard, relative to the same without it; in turns.
+
+    The loop in memory, but for the last: an embedded run, whose loop has a thread of its own.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        own = Path(folder) / "law.py"
+        own.write_text(_OWN_LAW)
+        pairs = {
+            "guard": (_loop("half_sample"), _loop("half_sample", guard="act")),
+            "operator identified": (_loop("half_sample"), _loop("half_sample", adapt=True)),
+            "one TPDO in ten missing": (_loop("half_sample"), _loop("half_sample", lost=0.1)),
+            "law of one's own": (_loop("standard"), _loop(f"{own}:own")),
+        }
+        found = {name: _ratio(*pair) for name, pair in pairs.items()}
+    found["thread of the loop"] = _ratio(
+        partial(_embedded, supervised=False), partial(_embedded, supervised=True)
+    )
+    return found
+
+
+#: `standard`, as a user would write it.
+_OWN_LAW = """def own(wall):
+    return max(0.0, -wall.stiffness * wall.y_sample)
+"""
+#: Cycles of an embedded run.
+_EMBEDDED = 100_000
+
+
+def _ratio(without: Callable[[], object], having: Callable[[], object]) -> dict[str, float]:
+    """Return the median ratio of the processor's times, and its range."""
+    without(), having()
+    ratios = sorted(_computed(having) / _computed(without) for _ in range(_RATIOS))
+    return {
+        "ratio": round(statistics.median(ratios), 3),
+        "least": round(ratios[0], 3),
+        "largest": round(ratios[-1], 3),
+    }
+
+
+def _computed(work: Callable[[], object]) -> float:
+    """Return the processor time of this process [s]: who else uses the machine matters less."""
+    start = time.process_time()
+    work()
+    return time.process_time() - start
+
+
+def _loop(
+    law: str, guard: str = "off", adapt: bool = False, lost: float = 0.0
+) -> Callable[[], object]:
+    settings = _struck(law)
+    given = settings.guard.model_copy(update={"action": guard})
+    operator = settings.operator.model_copy(update={"adapt": adapt})
+    settings = settings.model_copy(update={"guard": given, "operator": operator})
+    disturbances = Disturbances.none(_STRIKE)
+    disturbances.lost[10:] = np.random.default_rng(0).random(_STRIKE - 10) < lost
+    records = ClosedLoop(settings, _STRIKE, disturbances=disturbances).records()
+    into = records, 50.0, 0.0, np.zeros(1, ROW), np.empty((4, _STRIKE))
+
+    def strikes() -> None:
+        for _ in range(300):
+            simulate_wall(*into)
+
+    return strikes
+
+
+def _embedded(supervised: bool) -> None:
+    settings = config.load(config.shipped("config/sim.toml"), {"bus.exchange": "native"})
+    laws, ring = run_laws(settings), Ring.create()
+
+    def work(loop: Loop) -> bool:
+        while loop.j < _EMBEDDED and not loop.stops():
+            loop.exchange.cycle(loop.exchange.ahead)
+            ring.take_rows()
+        return False
+
+    with on_the_bus(settings) as link, closing(ring):
+        axis = make_axis(link, settings, drive_dictionary(settings), laws, ring)
+        with closing(make_exchange(link, [axis])) as exchange:
+            if supervised:
+                run_loop(exchange, work)
+                return
+            gc.collect()  # as run_loop does
+            loop = Loop(exchange)
+            loop.enable()
+            work(loop)
+            loop.leave()
 
 
 def _struck(law: str) -> Any:

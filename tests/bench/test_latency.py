@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from commands import COMMAND, Start, command, config_file, wait_for
 from matplotlib.image import imread
+from rig import eds_with
 
 import canwall.run
 from canwall import config, simdrive
@@ -19,10 +20,12 @@ from canwall.bench.latency import Histogram, Latency, LatencyPhase, measure_late
 from canwall.bench.latency_report import QUANTITIES, percentiles_us, report_lines, write_latency
 from canwall.config import Settings
 from canwall.cycle import HISTOGRAM, Grant, observe_ns
+from canwall.drive import DriveError
 from canwall.errors import InputError, RunFailedError
 from canwall.run import StopRequest
 
 REAL_TIME = {"bus.interface": "socketcan", "bus.channel": "can0"}
+READ_ONLY = 0x06010002.to_bytes(4, "little")
 GRANTED = {"scheduling": Grant("SCHED_FIFO, priority 45")}
 
 
@@ -48,10 +51,22 @@ class Listening:
         self._process = drive.process
         self.heard: list[tuple[int, bytes]] = []
         self.mute = False
+        #: Lets nobody write the quick stop's option, from the first RPDO on.
+        self.refusing = False
+        self._served = False
         drive.process = self._noted  # type: ignore[method-assign]
 
     def _noted(self, can_id: int, data: bytes) -> list[simdrive.Frame]:
         self.heard.append((can_id, data))
+        self._served |= can_id == 0x205
+        if (
+            self.refusing
+            and self._served
+            and can_id == 0x605
+            and data[0] >> 5 == 1
+            and data[1:3] == b"\x07\x60"
+        ):
+            return [(0x585, b"\x80" + data[1:4] + READ_ONLY)]
         frames = self._process(can_id, data)
         return [frame for frame in frames if not (self.mute and frame[0] == 0x185)]
 
@@ -87,7 +102,7 @@ def test_measured_without_torque_and_put_back(exchange: str, drives: list[Listen
     (listening,) = drives
     rpdos = {data for can_id, data in listening.heard if can_id == 0x205}
     assert rpdos == {bytes(4)}  # neither enabled nor with a torque
-    assert found.notes == ()
+    assert found.not_restored == ()
     upload = b"\x40\x00\x14\x05\0\0\0\0"  # the RPDO's event timer, a watchdog while it was measured
     answers = [data for can_id, data in listening._process(0x605, upload) if can_id == 0x585]
     assert answers[0][4:6] == b"\0\0"
@@ -110,6 +125,45 @@ def test_stopped_in_between(drives: list[Listening]) -> None:
     assert measure_latency(settings_of("native"), 60.0, 0, 0, stop, progress=ask) is None
     (listening,) = drives
     assert {data for can_id, data in listening.heard if can_id == 0x205} == {bytes(4)}
+
+
+NOT_RESTORED = "node 5: not restored: node 5: writing 0x1 to 0x6007:00 failed"
+
+
+def test_what_cannot_be_put_back_is_said(drives: list[Listening]) -> None:
+    def refuse(what: str, now_s: float, end_s: float) -> None:
+        drives[0].refusing = True
+
+    found = measure_latency(
+        settings_of("native"),
+        *(0.1, 0, 0, StopRequest()),
+        progress=refuse,
+    )
+    assert found is not None
+    (line,) = found.not_restored
+    assert line.startswith(NOT_RESTORED)
+
+
+def test_what_cannot_be_put_back_is_said_where_it_was_stopped(drives: list[Listening]) -> None:
+    stop = StopRequest()
+
+    def ask(what: str, now_s: float, end_s: float) -> None:
+        drives[0].refusing = True
+        stop.count = 1
+
+    with pytest.raises(DriveError, match=f"interrupted; {NOT_RESTORED}"):
+        measure_latency(settings_of("native"), 60.0, 0, 0, stop, progress=ask)
+
+
+def test_what_cannot_be_put_back_is_said_where_it_failed(drives: list[Listening]) -> None:
+    def mute(what: str) -> None:
+        drives[0].refusing = True
+        drives[0].mute = True
+
+    with pytest.raises(RunFailedError, match="no TPDO") as failed:
+        measure_latency(settings_of("python-can"), 0.1, 0, 0, StopRequest(), report=mute)
+    (note,) = failed.value.__notes__
+    assert note.startswith(NOT_RESTORED)
 
 
 # The shortest cycle
@@ -276,6 +330,17 @@ def test_command_over_unixcan(start: Start, tmp_path: Path) -> None:
     assert "exchange native; the drive is set up but not enabled" in done.stdout
     assert done.stdout.splitlines()[-1].startswith(("holds", "does not hold", "not even"))
     assert (tmp_path / "out" / "latency.png").exists()
+
+
+@pytest.mark.slow
+def test_command_that_cannot_put_the_drive_back(tmp_path: Path) -> None:
+    # The drive begins with an inhibit time that nobody may write.
+    odd = {("1800sub3", "DefaultValue"): "20\nHighLimit=10"}
+    eds = eds_with(tmp_path / "odd.eds", odd)
+    done = command("latency", "--eds", eds, "--duration", "0.1", "--load", "0")
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("canwall: node 5: not restored: node 5: writing 0x14 to 0x1800:03")
 
 
 @pytest.mark.parametrize(

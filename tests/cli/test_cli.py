@@ -15,7 +15,7 @@ from rig import eds_without
 
 import canwall.run
 from canwall import cli, config
-from canwall.errors import RunFailedError
+from canwall.errors import InputError, RunFailedError
 
 UNIXCAN_CONFIG = config.shipped("config/unixcan.toml")
 EDS = '"../eds/canwall-drive.eds"'
@@ -278,6 +278,20 @@ def test_exit_codes(
     monkeypatch.setattr(canwall.run, "run_together", fail)
     said = say("run")
     assert (said.code, said.err) == (code, err)
+
+
+@pytest.mark.parametrize("error", [RunFailedError("gone"), InputError("gone")])
+def test_what_is_not_in_order_after_an_error_is_told(
+    say: Say, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    error.add_note("not restored")
+
+    def fail(*args: object) -> None:
+        raise error
+
+    monkeypatch.setattr(canwall.run, "run_together", fail)
+    said = say("run")
+    assert (said.code, said.err) == (1, "canwall: gone\ncanwall: not restored\n")
 
 
 def test_what_is_wrong_in_a_program_is_not_hidden(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from commands import command, config_file
-from rig import settings_with
+from rig import eds_with, settings_with
 
 from canwall.config import Settings
 from canwall.errors import ConfigError
@@ -77,6 +77,19 @@ def test_command_finds_the_operator(tmp_path: Path) -> None:
         low, high = found[name]["interval"]
         assert low <= true <= high, name
         assert high - low < 0.2 * true, name
+
+
+@pytest.mark.slow
+def test_drive_that_is_not_restored_is_a_failure(tmp_path: Path) -> None:
+    odd = {("1800sub3", "DefaultValue"): "20\nHighLimit=10"}
+    eds = eds_with(tmp_path / "odd.eds", odd)
+    restored = {'"../eds/canwall-drive.eds"': f'"{eds}"\nrestore = true'}
+    path = config_file(tmp_path / "servo.toml", HELD | restored)
+    done = command("identify", path, "--hand", "--output", tmp_path / "record")
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("canwall: node 5: not restored: node 5: writing 0x14 to 0x1800:03")
+    assert (tmp_path / "record/identify.json").exists()
 
 
 @pytest.mark.slow

@@ -21,9 +21,10 @@ from commands import (
 )
 from rig import Loop, RigFactory, settings_with
 
+import canwall.run.changes
 from canwall import config
-from canwall.config import ConfigError
-from canwall.cycle import Outcome, WallStage
+from canwall.config import ConfigError, WallChange
+from canwall.cycle import Offer, Outcome, WallAxis, WallStage
 from canwall.errors import RunFailedError
 from canwall.record import Mailbox, RunFolder, read_signals
 from canwall.run.changes import open_to_changes, post_change
@@ -270,6 +271,33 @@ def test_change_that_the_wall_in_force_does_not_allow_is_refused(
     assert bench.answers[:2] == [300, 400]
     assert message in str(bench.answers[2])
     assert bench.answers[3:] == [600]
+
+
+def test_nothing_is_read_or_judged_in_the_loop(
+    make_rig: RigFactory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Bench(make_rig, tmp_path, {})
+    readers, judges, loops = set[int](), set[int](), set[int]()
+    text, judge = Mailbox.text, canwall.run.changes.judged
+
+    def noted_text(mailbox: Mailbox) -> str:
+        readers.add(threading.get_ident())
+        return text(mailbox)
+
+    def noted_judged(axis: WallAxis, change: WallChange) -> Offer:
+        judges.add(threading.get_ident())
+        return judge(axis, change)
+
+    def ask() -> None:
+        loops.add(threading.get_ident())
+        bench.ask("stiffness_nm_per_rad=20")
+
+    monkeypatch.setattr(Mailbox, "text", noted_text)
+    monkeypatch.setattr(canwall.run.changes, "judged", noted_judged)
+    bench.run({300: ask})
+    assert bench.answers == [300]
+    assert readers == judges
+    assert len(readers | loops) == 2
 
 
 def test_options_of_one_law_are_refused_while_others_alternate(

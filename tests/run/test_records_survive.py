@@ -29,6 +29,7 @@ from canwall import config
 from canwall.config import ConfigError
 from canwall.record import RunFolder, read_signals
 from canwall.record.folder import stream_of
+from canwall.record.pictures import DRAWN
 from canwall.run import read_run
 
 #: A hand that stays on the wall of an embedded drive.
@@ -184,6 +185,41 @@ def test_damaged_rows_are_not_read_as_data(four_strikes: Record, tmp_path: Path)
         except ConfigError:
             found += 1
     assert found > 50
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        *(("y", value, "column y has values of no run") for value in (np.inf, np.nan, -1e300)),
+        ("position_rad", -1e30, "counts_per_rev has to be positive"),
+        ("phase", 77, r".*77.* is not a valid Phase"),
+    ],
+)
+def test_damaged_rows_of_a_stream_are_no_run(
+    four_strikes: Record, tmp_path: Path, name: str, value: float, said: str
+) -> None:
+    """A stream of rows, of a run that was cut off, has no checksums."""
+    folder = copy_of(four_strikes.folder, tmp_path / "run", "config.toml")
+    values = four_strikes.column(name).copy()
+    values[:] = value
+    column = four_strikes.signals.schema.get_field_index(name)
+    kind = four_strikes.signals.schema.field(name)
+    damaged = four_strikes.signals.set_column(column, kind, pa.array(values, kind.type))
+    with pa.ipc.new_stream(stream_of(folder.signals), damaged.schema) as stream:
+        stream.write_table(damaged)
+    with pytest.raises(ConfigError, match=f"damaged: {said}"):
+        read_run(folder, DRAWN)
+    assert not folder.summary.exists()
+
+
+def test_stream_with_a_damaged_name_is_no_record(four_strikes: Record, tmp_path: Path) -> None:
+    folder = copy_of(four_strikes.folder, tmp_path / "run", "config.toml")
+    stream = stream_of(folder.signals)
+    with pa.ipc.new_stream(stream, four_strikes.signals.schema) as file:
+        file.write_table(four_strikes.signals)
+    stream.write_bytes(stream.read_bytes().replace(b"y_est", b"y\xefest"[:5]))
+    with pytest.raises(ConfigError, match="not a record of a run"):
+        read_run(folder)
 
 
 def test_rows_of_another_kind_are_no_record(four_strikes: Record, tmp_path: Path) -> None:

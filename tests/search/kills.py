@@ -19,7 +19,7 @@ from typing import Any
 
 import can
 import numpy as np
-from commands import COMMAND, ON_A_BUSY_MACHINE, PATIENCE_S, config_file, wait_for
+from commands import COMMAND, ON_A_BUSY_MACHINE, PATIENCE_S, config_file
 from fuzzing import FoundError
 from rig import RPDO1, TPDO1, eds_without
 from test_ways_out import EMCY, WATCHDOGS, Witness, rpdo
@@ -107,7 +107,9 @@ def _turn(
             witness = _Stamped(folder / "bus")
             try:
                 if in_contact:
-                    wait_for(lambda: witness.torque_is_on() or master.poll() is not None)
+                    # A first start compiles for as long as it takes.
+                    while not witness.torque_is_on() and master.poll() is None:
+                        time.sleep(0.01)
                 time.sleep(wait_s)
                 before = len(witness.frames)
                 witness.sent_s = time.time()
@@ -121,6 +123,8 @@ def _turn(
                     raise AssertionError(f"statusword {statusword:#06x}, {torque} per mille")
                 if name == "SIGSTOP":  # what it still has to say has to be harmless
                     master.send_signal(signal.SIGCONT)
+                    if phase in ("setting up", "enabling"):  # it has lost nothing, and may go on
+                        master.send_signal(signal.SIGTERM)
                     master.wait(PATIENCE_S)
                     torque = witness.read(0x6077)
                     if torque or witness.read(0x6041) & 0x6F == 0x27:

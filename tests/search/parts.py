@@ -67,6 +67,10 @@ CASES = {
     "[](ways_out.md) says; frames, cycles and words are all in the record.": (
         "tests/run/test_fault_matrix.py"
     ),
+    "A fault in any single call on the way out (an exception, a signal, a call that hangs) "
+    "leaves no torque, and the words are there.": (
+        "tests/cycle/test_every_call_on_the_way_out.py tests/cycle/test_loop.py"
+    ),
     "A master that is asked to end, that dies, stands still, or whose law or writer fails, "
     "leaves no torque.": "tests/run/test_ways_out.py",
     "A simulated drive that loses its master ends its torque, as its objects say.": (
@@ -75,7 +79,20 @@ CASES = {
     "The limits of a wall trip in their cycle, and not without a reason.": (
         "tests/cycle/test_step.py tests/sweep/test_no_false_trips.py"
     ),
-    "A record is whole, and says so where it is not.": "tests/record",
+    "TPDOs that are missing or late, torques that are late, positions that overflow and a master "
+    "that stands still throw no handle, or are told.": (
+        "tests/run/test_disturbances.py tests/run/test_torque_delay.py"
+    ),
+    "A record is whole, and says so where it is not; one that was cut off is completed from its "
+    "rows.": "tests/record tests/run/test_records_survive.py",
+    "A damaged journal of a sweep is never read as data; a law that hangs, or a worker that dies, "
+    "is named and costs no finished piece.": "tests/sweep/test_sweep.py",
+    "A drive that is not what its file says, or not alone under its node-ID, is named before "
+    "it is enabled, and put back as it was or that is said.": "tests/drive tests/bench",
+    "A change is judged against the wall that is in force, and refused to the one who asked.": (
+        "tests/run/test_changes.py"
+    ),
+    "Code that is called is the code that is there.": "tests/test_compiled.py",
 }
 
 

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import COMMAND, PATIENCE_S, Record, torque_is_on, wait_for
+from commands import COMMAND, PATIENCE_S, Record, config_file, torque_is_on, wait_for
 from hypothesis import example, given
 from hypothesis import strategies as st
-from rig import SIM_CONFIG
+from rig import SIM_CONFIG, eds_with
 
 from canwall.errors import InputError
 from canwall.study.session import Verdict
@@ -31,11 +31,13 @@ pytestmark = pytest.mark.slow
 class Person:
     """A study in a process of its own: reads its prompts and answers them."""
 
-    def __init__(self, study: str, folder: Path, *arguments: object) -> None:
+    def __init__(
+        self, study: str, folder: Path, *arguments: object, config: Path = SIM_CONFIG
+    ) -> None:
         self.folder = folder
         options = ["--output", folder, *map(str, arguments)]
         self.process = subprocess.Popen(
-            [COMMAND, "study", study, SIM_CONFIG, *options],
+            [COMMAND, "study", study, config, *options],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -205,6 +207,26 @@ def test_a_wall_ends_with_its_person(folder: Path, people: list[Person], way: st
     assert "The drive is disabled." in said
     assert "0 verdicts" in said
     assert_ended(folder / "01-K5")
+
+
+def test_a_drive_that_is_not_restored_is_told_in_the_end(
+    folder: Path, people: list[Person], tmp_path: Path
+) -> None:
+    odd = {("1800sub3", "DefaultValue"): "20\nHighLimit=10"}
+    eds = eds_with(tmp_path / "odd.eds", odd)
+    changes = {'"../eds/canwall-drive.eds"': f'"{eds}"\nrestore = true'}
+    config = config_file(tmp_path / "config.toml", changes)
+    person = Person("staircase", folder, "--seconds", ONE, config=config)
+    people.append(person)
+    person.read_to(BEGINS)
+    person.type("")
+    person.read_to(STRUCK)
+    person.type("y")
+    person.read_to(BEGINS)
+    person.type("q")
+    code, _, errors = person.end()
+    assert code == 1
+    assert errors.startswith("canwall: node 5: not restored: node 5: writing 0x14 to 0x1800:03")
 
 
 def test_ctrl_c_between_two_walls(folder: Path, people: list[Person]) -> None:

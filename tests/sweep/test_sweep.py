@@ -446,6 +446,35 @@ def test_a_worker_that_dies_is_one_line(tmp_path: Path) -> None:
     assert errors == f"canwall: {line}\n"
 
 
+HANGING = """def hanging(wall):
+    '''Does not return from walls that are stiff.'''
+    if wall.stiffness > 50.0:
+        while wall.y < 0.0:
+            pass
+    return -wall.stiffness * min(wall.y, 0.0)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("through", ["sim", "bus"])
+def test_a_law_that_does_not_return_is_named_with_its_point(tmp_path: Path, through: str) -> None:
+    """Pieces of work that end are in the journal: those of the law that returns."""
+    law, output = tmp_path / "laws.py", tmp_path / "a.nc"
+    law.write_text(HANGING)
+    done = command(
+        *("sweep", settings_file(), "--output", output, "--through", through, "--workers", "1"),
+        *("--law", "standard", "--law", f"{law}:hanging", "--stiffness", "20,60"),
+        *("--axis", "speed=1", "--axis", "phase=0"),
+    )
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert "stiffness 60, damping 0: cycle " in line
+    assert f": law {law}:hanging has not returned for 0." in line
+    assert line.endswith(f"; --resume continues {output}")
+    (piece,) = (tmp_path / "a.nc.partial").read_text().splitlines()[1:]
+    assert piece.startswith("0 ")
+
+
 @pytest.mark.parametrize(
     ("axes", "message"),
     [
