@@ -119,7 +119,7 @@ def _loop(
     disturbances = Disturbances.none(_STRIKE)
     disturbances.lost[10:] = np.random.default_rng(0).random(_STRIKE - 10) < lost
     records = ClosedLoop(settings, _STRIKE, disturbances=disturbances).records()
-    into = records, 50.0, 0.0, np.zeros(1, ROW), np.empty((4, _STRIKE))
+    into = records, 50.0, 0.0, np.zeros(1, ROW), np.empty((SIGNALS, _STRIKE))
 
     def strikes() -> None:
         for _ in range(300):
