@@ -220,8 +220,7 @@ def modelled_delay(settings: Settings) -> float:
 def _hands(settings: Settings) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return masses and viscous dampings of the bank: the drive with lighter and heavier hands."""
     operator, mechanics = settings.operator, settings.mechanics
-    lightest = operator.lightest_kg_m2 or mechanics.inertia_kg_m2
-    masses = np.geomspace(lightest, operator.heaviest_kg_m2, operator.filters)
+    masses = np.geomspace(*settings.masses, operator.filters)
     hands = [
         hand_damping(max(mass - mechanics.inertia_kg_m2, 0.0), operator.damping_nm_s_per_rad)
         for mass in masses.tolist()

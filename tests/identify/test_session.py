@@ -19,7 +19,7 @@ FREE = {
     "damping_nm_s_per_rad = 0.0256": "damping_nm_s_per_rad = 0.0",
     "stiffness_nm_per_rad = 3.2": "stiffness_nm_per_rad = 0.0",
     "strikes = 4\n": "strikes = 0\n",
-    "current_bandwidth_hz = 0.0 # of the": "current_bandwidth_hz = 800.0 # of the",
+    "current_bandwidth_hz = 1600.0 # of the": "current_bandwidth_hz = 800.0 # of the",
     "inertia_kg_m2 = 1.64e-4": "inertia_kg_m2 = 1.2e-4",
 }
 #: The hand of config/sim.toml, which rests, on a handle whose [mechanics] are known.
