@@ -56,6 +56,7 @@ NO_LAW = -1
 RENDERED = np.dtype(
     [
         ("law", "i8"),  # index into the laws of the cycle
+        ("sampled", "?"),  # it goes by no model
         ("position", "f8"),
         ("estimated_velocity", "?"),
         ("divider", "i8"),  # cycles from one evaluation of the law to the next
@@ -299,6 +300,7 @@ def set_wall(cycle: NDArray[np.void], wall: Wall, laws: Sequence[Law]) -> None:
     rendered = cycle["rendered"][0]
     known = rendered["wall"][0]
     rendered["position"] = wall.position_rad
+    rendered["sampled"] = law.sampled
     rendered["estimated_velocity"] = wall.velocity == "estimated"
     if wall.divider != rendered["divider"]:
         # The law's torques are held until it is evaluated again.

@@ -142,7 +142,7 @@ def _force_of(cycle: Record, rendered: Record, due: bool) -> float:
         # A law that does not return is named by what looks at this cycle from beside it.
         cycle.evaluated = rendered.law + 1
         rendered.force = wall_force(cycle.laws[rendered.law], rendered.wall[0])
-        if cycle.bank[0].adapts:
+        if cycle.bank[0].adapts and not rendered.sampled:
             rendered.force = bounded_push(cycle.bank[0], rendered.wall[0], rendered.force)
         cycle.evaluated = 0
     return cycle.guard[0].factor * rendered.force

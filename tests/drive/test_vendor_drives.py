@@ -132,7 +132,7 @@ def test_strikes_come_out_as_on_our_own_drive(drive: Drive, make_rig: RigFactory
 
 
 def test_run(drive: Drive, tmp_path: Path) -> None:
-    """The four strikes through the command: the plain wall chatters, the prediction does not."""
+    """The four strikes through the command: the plain wall chatters, the default does not."""
     done = command(
         "run",
         DRIVES / f"{drive.name}.toml",
@@ -144,9 +144,9 @@ def test_run(drive: Drive, tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     strikes = Record(tmp_path / "run").summary["strikes"]
-    assert [strike["law"] for strike in strikes] == ["standard", "half_sample"] * 2
-    assert [strike["chatter"] for strike in strikes] == [True, False, True, False]
-    assert [strikes[i]["contacts"] for i in (1, 3)] == [1, 1]
+    assert [strike["law"] for strike in strikes] == ["mean_force", "standard"] * 2
+    assert [strike["chatter"] for strike in strikes] == [False, True, False, True]
+    assert [strikes[i]["contacts"] for i in (0, 2)] == [1, 1]
 
 
 def test_maxon_counts_the_rated_torque_in_micro(make_rig: RigFactory) -> None:

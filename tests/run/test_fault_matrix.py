@@ -110,7 +110,7 @@ def run_with(folder: Path, toml: str, exchange: str) -> int:
     changes = {
         'exchange = "auto" ': f'exchange = "{exchange}" ',
         "duration_s = 4.2": f"duration_s = {DURATION_S}",
-        'law = "standard" ': 'law = "half_sample" ',
+        'law = "mean_force" ': 'law = "half_sample" ',
     }
     file = config_file(folder / "c.toml", changes)
     text = file.read_text().split("[[schedule]]")[0]
