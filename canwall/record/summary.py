@@ -48,7 +48,7 @@ def summarise(
     touched = metrics.contacts(np.where(rendering, y, np.inf), force)
     strikes = [
         _strike(strike, y, force, work, stiffness, laws, settings, units, referent, referent_felt)
-        for strike in metrics.strikes(touched, settings.bus.cycle_s, _changes(signals))
+        for strike in metrics.strikes(touched, settings.bus.cycle_s, _changes(signals, settings))
     ]
     chattering = [s for s in strikes if s["chatter"]]
     torque = numbers(signals, "torque_cmd")
@@ -68,10 +68,13 @@ def summarise(
     }
 
 
-def _changes(signals: "pa.Table") -> Array:
+def _changes(signals: "pa.Table", settings: Settings) -> Array:
     """Return the cycles at which law, stiffness, damping or position of the wall change."""
     columns = [np.from_dlpack(signals["law"].combine_chunks().indices)]
-    columns += [numbers(signals, name) for name in ("stiffness", "damping", "wall_position_rad")]
+    columns += [numbers(signals, name) for name in ("stiffness", "wall_position_rad")]
+    # The damping that belongs to a damping ratio follows the mass in force.
+    if not any(stage.wall.damping_ratio for stage in settings.stages):
+        columns.append(numbers(signals, "damping"))
     differs = np.any([np.diff(column) != 0 for column in columns], axis=0)
     return np.flatnonzero(differs).astype(float) + 1.0
 
