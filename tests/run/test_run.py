@@ -65,14 +65,21 @@ def test_standard_chatters_and_mean_force_does_not(four_strikes: Record) -> None
         assert "makes and breaks" in standard["chatter_reason"]
 
 
-def test_signals_are_those_of_a_wall_one_period_late(four_strikes: Record) -> None:
-    """The torque of a row is the law's at this sample, and acts from the next SYNC on."""
+def test_signals_are_those_of_a_wall_as_late_as_bus_and_drive(four_strikes: Record) -> None:
+    """The torque of a row is the law's at this sample, and acts from the next SYNC on.
+
+    The drive's own cycle and its current loop add 0.25 and 0.1 ms: of a period, that much has the
+    torque of the row before.
+    """
     law, y = four_strikes.column("law"), four_strikes.column("y")
     wanted, per_mille = four_strikes.column("force"), four_strikes.column("torque_cmd_per_mille")
     standard = (law == "standard") & (four_strikes.column("phase") == Phase.RENDERING)
     assert wanted[standard] == pytest.approx(np.maximum(-50.0 * y[standard], 0.0))
     applied, commanded = four_strikes.column("torque_applied"), four_strikes.column("torque_cmd")
-    assert np.array_equal(applied[1:], commanded[:-1])
+    older = 0.25 + 1.0 / (2.0 * math.pi * 1.6)
+    assert four_strikes.summary["delay_cycles"] == pytest.approx(1.0 + older)
+    expected = older * commanded[:-2] + (1.0 - older) * commanded[1:-1]
+    np.testing.assert_allclose(applied[2:], expected, atol=1e-12)
     nm_per_mille = four_strikes.summary["drive"]["nm_per_mille"]
     assert commanded == pytest.approx(per_mille * nm_per_mille)
     # The limit of 1.9 N·m is rounded towards zero.
