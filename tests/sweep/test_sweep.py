@@ -151,7 +151,7 @@ def test_a_buzz_within_six_counts_is_felt() -> None:
     ],
 )
 def test_numbers_of_plant_and_strike_are_axes(axis: str, values: list[float]) -> None:
-    plan = plan_of(stiffness=[20.0], **{axis: values})
+    plan = plan_of(stiffness=[20.0], **{"simulation.ideal": [False], axis: values})
     one, other = (compute_piece(plan, piece)[0, 0] for piece in range(2))
     assert one["penetration"] != other["penetration"]
 
