@@ -112,9 +112,11 @@ CYCLE = np.dtype(
         ("guard", GUARD, (1,)),
         ("estimator", ESTIMATOR, (1,)),
         ("bank", BANK, (1,)),
-        # The estimator for TPDOs that are a cycle late since one was missing: while it is being
-        # compared, how much likelier it has been; the number of cycles that was found.
+        # The estimator for TPDOs that are a cycle late since one was missing, and the one for a
+        # TPDO that was lost, both without the bank: while they are being compared, how much
+        # likelier the first has been; the number of cycles that was found.
         ("lagging", ESTIMATOR, (1,)),
+        ("losing", ESTIMATOR, (1,)),
         ("compares_lag", "?"),
         ("lag_evidence", "f8"),
         ("lag", "i8"),

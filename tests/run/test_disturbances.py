@@ -167,6 +167,18 @@ def test_tpdos_that_are_in_time_again(end: float) -> None:
     assert np.abs(run.rows["y_est"][last] - quiet.rows["y_est"][last]).max() < 1e-3
 
 
+@pytest.mark.parametrize("begin", [330, 700])
+def test_an_adapting_model_tells_lost_from_late(begin: int) -> None:
+    """While the hand presses, and the handle stands still: what decides is its way out."""
+    given: dict[str, Any] = {"operator.adapt": True, "mechanics.inertia_kg_m2": 1e-4}
+    settings, cycles = wall(1e-3, 50.0, **given)
+    lost = Disturbances.none(cycles)
+    lost.lost[begin] = True
+    assert simulate(settings, cycles, disturbances=lost).lag == 0
+    late = simulate(settings, cycles, disturbances=late_from(cycles, begin, cycles))
+    assert (late.trip, late.lag) == (Trip.NONE, 1)
+
+
 def test_tpdo_that_is_late_once_does_not_disturb_the_estimate() -> None:
     settings, cycles = wall(1e-3, 50.0, **{"simulation.ideal": True})  # type: ignore[arg-type]
     begin = 262  # as the handle hits the wall

@@ -87,7 +87,7 @@ def test_run_finds_the_file_beside_its_configuration(example: str, tmp_path: Pat
     config = config_file(
         tmp_path / "mine.toml",
         {
-            'law = "standard"': 'law = "my_law.py:my_law"',
+            'law = "mean_force"': 'law = "my_law.py:my_law"',
             "[estimator]": "[wall.options]\ngrowth = 2.5\n\n[estimator]",
             "duration_s = 4.2": "duration_s = 0.6",
         },
