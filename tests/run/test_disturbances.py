@@ -24,7 +24,12 @@ def wall(
     period: float, stiffness: float, hand: dict[str, float] | None = None, **overrides: Any
 ) -> tuple[Settings, int]:
     """Four strikes on one wall, and their cycles."""
-    given = {
+    # Cogging and torque steps, but no lag.
+    given: dict[str, Any] = {
+        "simulation.ideal": False,
+        "simulation.current_bandwidth_hz": 0.0,
+        "simulation.drive_cycle_s": 0.0,
+        "simulation.stiction_nm": 0.01,
         "bus.cycle_s": period,
         "wall.law": "half_sample",
         "wall.stiffness_nm_per_rad": stiffness,
