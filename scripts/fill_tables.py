@@ -20,7 +20,7 @@ from canwall.sweep import (
 )
 
 ROOT = Path(__file__).parents[1]
-CONFIG = ROOT / "config" / "servo.toml"
+CONFIG = ROOT / "config" / "sim.toml"
 PAGES = (ROOT / "README.md", ROOT / "docs" / "results.md")
 #: Laws of the short table in README.md.
 SHORT = ("standard", "damped", "half_sample", "mean_force")

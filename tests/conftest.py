@@ -5,6 +5,7 @@ Reports unmarked tests that are `slow` by the rule in pyproject.toml.
 
 import contextlib
 import gc
+import re
 import signal
 import subprocess
 import sys
@@ -16,7 +17,7 @@ from typing import Any
 import fork_server
 import hypothesis
 import pytest
-from commands import Record, Start, installed_command
+from commands import GUARD_SAID, Record, Start, installed_command
 from fork_server import PYTHON, ForkedPopen
 from rig import Rig, RigFactory
 
@@ -138,6 +139,8 @@ def four_strikes(tmp_path_factory: pytest.TempPathFactory) -> Record:
     """The main job as it comes: four strikes, the law changing between them."""
     folder = tmp_path_factory.mktemp("four_strikes") / "run"
     done = installed_command("run", "--output", folder)
-    assert (done.returncode, done.stderr) == (0, "")
+    assert done.returncode == 0
+    # The plain wall's strikes.
+    assert re.fullmatch(GUARD_SAID, done.stderr)
     (folder / "stdout.txt").write_text(done.stdout)
     return Record(folder)

@@ -31,6 +31,7 @@ from canwall.record import Ring
 from canwall.run import make_monitor
 
 SIM_CONFIG = config.shipped("config/sim.toml")
+IDEAL_CONFIG = config.shipped("config/ideal.toml")
 SYNC, TPDO1, RPDO1, SDO_REQUEST, SDO_ANSWER = 0x080, 0x185, 0x205, 0x605, 0x585
 
 Object: TypeAlias = tuple[int, int]
@@ -44,8 +45,8 @@ _INITIATE_DOWNLOAD = 1
 
 
 def settings_with(overrides: Mapping[str, Any] | None = None) -> Settings:
-    """config/sim.toml with other values under dotted keys."""
-    return config.load(SIM_CONFIG, overrides)
+    """config/ideal.toml with other values under dotted keys: an ideal servo, a matched model."""
+    return config.load(IDEAL_CONFIG, overrides)
 
 
 def multiplexer(data: bytes) -> Object:

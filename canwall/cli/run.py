@@ -98,6 +98,9 @@ def _tell(results: "Sequence[RunResult]") -> int:
 
 def _run_settings(path: Path, overrides: dict[str, Any]) -> "Settings":
     settings = settings_from(path, **overrides)
+    if overrides["wall__damping_nm_s_per_rad"] is not None:
+        wall = settings.wall.model_copy(update={"damping_ratio": None})
+        settings = settings.model_copy(update={"wall": wall})
     if overrides["wall__law"] is not None:
         kept = tuple(change.model_copy(update={"law": None}) for change in settings.schedule)
         settings = settings.model_copy(update={"schedule": kept})

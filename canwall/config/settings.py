@@ -1,6 +1,6 @@
 """The sections of a configuration, and the checks that span several of them."""
 
-from typing import Annotated, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import tomli_w
 from pydantic import Field, field_validator, model_validator
@@ -17,6 +17,12 @@ from canwall.config.section import (
 )
 from canwall.config.simulation import Simulation
 from canwall.config.sweep import AxisValues
+
+#: What the model knows of an ideal drive.
+_IDEAL_DRIVE = {"drive_cycle_s": 0.0, "current_bandwidth_hz": 0.0}
+
+#: Inertia of the heaviest hand: an arm of 0.69 kg at a handle of 80 mm.
+_HEAVIEST_HAND_KG_M2 = 4.4e-3
 
 
 class Bus(Section):
@@ -95,14 +101,15 @@ class Operator(Section):
         adapt: Identify it. [mechanics] is then the drive with its handle, without a hand.
         lightest_kg_m2: Inertia of drive, handle and hand to begin with. Default: that of
             [mechanics].
-        heaviest_kg_m2: Largest inertia of drive, handle and hand.
+        heaviest_kg_m2: Largest inertia of drive, handle and hand. Default: 4.4e-3 more than the
+            lightest, an arm at a handle of 80 mm.
         damping_nm_s_per_rad: Damping of a heavy hand; a light one has less.
         filters: Number of hands, in geometric progression, that are compared in each cycle.
     """
 
-    adapt: bool = False
+    adapt: bool = True
     lightest_kg_m2: Positive | None = None
-    heaviest_kg_m2: Positive = 4.5e-3
+    heaviest_kg_m2: Positive | None = None
     damping_nm_s_per_rad: NonNegative = 0.04
     filters: int = Field(16, ge=3, le=24)
 
@@ -185,6 +192,8 @@ class WallChange(_WallKeys):
         update = self.model_dump(exclude={"at_s", "limits"}, exclude_none=True)
         if self.law is not None:
             update.setdefault("options", {})  # options belong to the previous law
+        if self.damping_nm_s_per_rad is not None:
+            update.setdefault("damping_ratio", None)  # a damping that is given takes its place
         if self.limits is not None:
             limits = limits.model_copy(update=self.limits.model_dump(exclude_none=True))
         return wall.model_copy(update=update), limits
@@ -220,6 +229,18 @@ class Settings(Section):
     schedule: tuple[Scheduled, ...] = ()
     sweep: dict[str, AxisValues] = Field(default_factory=dict)
 
+    @model_validator(mode="before")
+    @classmethod
+    def _idealise(cls, values: Any) -> Any:
+        """Let the model know of an ideal servo (`[simulation] ideal`)."""
+        if not isinstance(values, dict):
+            return values
+        drive, simulation = values.get("drive"), values.get("simulation")
+        ideal = isinstance(simulation, dict) and simulation.get("ideal") is True
+        if ideal and isinstance(drive, dict):
+            return values | {"drive": drive | _IDEAL_DRIVE}
+        return values
+
     @field_validator("schedule", mode="before")
     @classmethod
     def _changes(cls, value: object) -> object:
@@ -232,11 +253,11 @@ class Settings(Section):
                 f"bus.master_id = {self.bus.master_id} is the drive's own node-ID: no two nodes of "
                 f"a bus may share one"
             )
-        lightest = self.operator.lightest_kg_m2 or self.mechanics.inertia_kg_m2
-        if self.operator.adapt and not lightest < self.operator.heaviest_kg_m2:
+        lightest, heaviest = self.masses
+        if self.operator.adapt and not lightest < heaviest:
             raise ValueError(
-                f"operator.heaviest_kg_m2 = {self.operator.heaviest_kg_m2:g}: has to be more than "
-                f"the lightest inertia, {lightest:g}; raise it, or lower operator.lightest_kg_m2"
+                f"operator.heaviest_kg_m2 = {heaviest:g}: has to be more than the lightest "
+                f"inertia, {lightest:g}; raise it, or lower operator.lightest_kg_m2"
             )
         if [c.at_s for c in self.schedule] != sorted(c.at_s for c in self.schedule):
             raise ValueError("schedule: the entries have to be in the order of at_s")
@@ -270,9 +291,15 @@ class Settings(Section):
 
     def with_ideal_servo(self) -> Self:
         """Return the same with an ideal simulated servo, of which the model of the laws knows."""
-        drive = self.drive.model_copy(update={"drive_cycle_s": 0.0, "current_bandwidth_hz": 0.0})
+        drive = self.drive.model_copy(update=_IDEAL_DRIVE)
         simulation = self.simulation and self.simulation.with_ideal_servo()
         return self.model_copy(update={"drive": drive, "simulation": simulation})
+
+    @property
+    def masses(self) -> tuple[float, float]:
+        """Least and largest inertia of drive, handle and hand that is reckoned with [kg·m²]."""
+        lightest = self.operator.lightest_kg_m2 or self.mechanics.inertia_kg_m2
+        return lightest, self.operator.heaviest_kg_m2 or lightest + _HEAVIEST_HAND_KG_M2
 
     @property
     def embedded(self) -> bool:

@@ -21,6 +21,9 @@ _IDEAL: dict[str, Any] = {
     "shaft_hz": 0.0,
 }
 
+#: Stiction over Coulomb friction, where it is not given.
+_BREAKAWAY = 1.5
+
 
 class Simulation(Section):
     """`[simulation]`: the mechanics of the simulated drive, and the hand on its handle.
@@ -33,7 +36,7 @@ class Simulation(Section):
     `home_switch_rad`. Parameters stored through 0x1010 are kept in the file `store`, if given.
 
     Friction is `coulomb_nm` in motion; at rest it holds up to `stiction_nm`, at least as much and
-    by default the same. The motor's cogging torque is a triangle wave of amplitude
+    by default 1.5 times that. The motor's cogging torque is a triangle wave of amplitude
     `cogging_nm`, with `cogs_per_rev` periods per revolution. The current loop is a first-order lag
     of `current_bandwidth_hz` (0: no lag) with a resolution of `torque_step_nm` (0: exact). The
     motor delivers 1 + `torque_constant_error` of the torque that the drive believes and shows
@@ -67,14 +70,14 @@ class Simulation(Section):
     stiction_nm: NonNegative | None = None
     cogging_nm: NonNegative = 0.003
     cogs_per_rev: int = Field(24, ge=1, le=10_000)
-    current_bandwidth_hz: Annotated[NonNegative, Field(le=1e6)] = 0.0
+    current_bandwidth_hz: Annotated[NonNegative, Field(le=1e6)] = 1600.0
     shaft_hz: Annotated[NonNegative, Field(le=1e5)] = 0.0
     shaft_damping_ratio: Annotated[NonNegative, Field(lt=1.0)] = 0.02
     rotor_inertia_kg_m2: Positive = 1.06e-5
     torque_step_nm: NonNegative = 0.0003
     torque_constant_error: Annotated[Number, Field(gt=-1.0, le=1.0)] = 0.0
-    drive_cycle_s: Annotated[NonNegative, Field(le=0.1)] = 0.0
-    clock_ppm: Annotated[Number, Field(ge=-1e4, le=1e4)] = 0.0
+    drive_cycle_s: Annotated[NonNegative, Field(le=0.1)] = 0.00025
+    clock_ppm: Annotated[Number, Field(ge=-1e4, le=1e4)] = 50.0
     clock_phase: Annotated[NonNegative, Field(le=1.0)] = 0.5
     velocity_filter_hz: NonNegative = 200.0
     peak_torque_nm: Positive | None = None
@@ -104,7 +107,9 @@ class Simulation(Section):
     @property
     def breakaway_nm(self) -> float:
         """Torque that sets the handle in motion from rest."""
-        return self.coulomb_nm if self.stiction_nm is None else self.stiction_nm
+        if self.stiction_nm is not None:
+            return self.stiction_nm
+        return self.coulomb_nm if self.ideal else _BREAKAWAY * self.coulomb_nm
 
     def with_ideal_servo(self) -> Self:
         """Return the same mechanics with an ideal motor and drive, as `ideal` makes them."""

@@ -61,6 +61,7 @@ NO_LAW = -1
 RENDERED = np.dtype(
     [
         ("law", "i8"),  # index into the laws of the cycle
+        ("sampled", "?"),  # it goes by no model
         ("position", "f8"),
         ("estimated_velocity", "?"),
         ("divider", "i8"),  # cycles from one evaluation of the law to the next
@@ -116,9 +117,11 @@ CYCLE = np.dtype(
         ("guard", GUARD, (1,)),
         ("estimator", ESTIMATOR, (1,)),
         ("bank", BANK, (1,)),
-        # The estimator for TPDOs that are a cycle late since one was missing: while it is being
-        # compared, how much likelier it has been; the number of cycles that was found.
+        # The estimator for TPDOs that are a cycle late since one was missing, and the one for a
+        # TPDO that was lost, both without the bank: while they are being compared, how much
+        # likelier the first has been; the number of cycles that was found.
         ("lagging", ESTIMATOR, (1,)),
+        ("losing", ESTIMATOR, (1,)),
         ("compares_lag", "?"),
         ("lag_evidence", "f8"),
         ("lag", "i8"),
@@ -225,8 +228,7 @@ def modelled_delay(settings: Settings) -> float:
 def _hands(settings: Settings) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return masses and viscous dampings of the bank: the drive with lighter and heavier hands."""
     operator, mechanics = settings.operator, settings.mechanics
-    lightest = operator.lightest_kg_m2 or mechanics.inertia_kg_m2
-    masses = np.geomspace(lightest, operator.heaviest_kg_m2, operator.filters)
+    masses = np.geomspace(*settings.masses, operator.filters)
     hands = [
         hand_damping(max(mass - mechanics.inertia_kg_m2, 0.0), operator.damping_nm_s_per_rad)
         for mass in masses.tolist()
@@ -310,6 +312,7 @@ def set_wall(cycle: NDArray[np.void], wall: Wall, laws: Sequence[Law]) -> None:
     rendered = cycle["rendered"][0]
     known = rendered["wall"][0]
     rendered["position"] = wall.position_rad
+    rendered["sampled"] = law.sampled
     rendered["estimated_velocity"] = wall.velocity == "estimated"
     if wall.divider != rendered["divider"]:
         # The law's torques are held until it is evaluated again.

@@ -21,6 +21,7 @@ from canwall.walls import (
     correct,
     correct_bank,
     end_lag,
+    likelier,
     may_lag,
     note_missing_sample,
     predict,
@@ -28,9 +29,9 @@ from canwall.walls import (
     predict_open_loop,
     put_in_force,
     set_applied_force,
+    set_model,
     stand_still,
     start_lagging,
-    surprise,
     wall_force,
     with_probe,
 )
@@ -121,6 +122,9 @@ def _identify_operator(cycle: Record) -> None:
         change_plant(cycle.rendered[0].wall[0], estimator.mass, estimator.viscous)
         if cycle.fade_left > 0:
             change_plant(cycle.faded[0].wall[0], estimator.mass, estimator.viscous)
+        if cycle.compares_lag:
+            set_model(cycle.lagging[0], estimator.mass, estimator.viscous, bank.spring)
+            set_model(cycle.losing[0], estimator.mass, estimator.viscous, bank.spring)
 
 
 @compiled
@@ -210,7 +214,7 @@ def _force_with_tpdo(cycle: Record, due: bool) -> float:
     if not math.isfinite(force):
         cycle.trip = _NAN
         return 0.0
-    if cycle.bank[0].adapts:
+    if cycle.bank[0].adapts and not cycle.rendered[0].sampled:
         force = with_probe(cycle.bank[0], cycle.rendered[0].wall[0], force)
     return force
 
@@ -284,6 +288,7 @@ def _may_begin_to_lag(cycle: Record) -> bool:
     known = cycle.compares_lag and cycle.lag_evidence > 0.0
     if known:
         note_missing_sample(cycle.lagging[0])
+        note_missing_sample(cycle.losing[0])
     if known or not cycle.started or not may_lag(estimator):
         return False
     cycle.lagging[0] = estimator
@@ -295,8 +300,8 @@ def _may_begin_to_lag(cycle: Record) -> bool:
 @compiled
 def _compare_lag(cycle: Record) -> None:
     """Compare the sample with both predictions, and go on with the likelier one in the end."""
-    estimator, lagging = cycle.estimator[0], cycle.lagging[0]
-    cycle.lag_evidence += surprise(estimator, cycle.oriented) - surprise(lagging, cycle.oriented)
+    lagging, losing = cycle.lagging[0], cycle.losing[0]
+    cycle.lag_evidence += likelier(lagging, losing, cycle.oriented)
     if cycle.lag_evidence > _LAG_EVIDENCE:
         cycle.estimator[0] = lagging
         cycle.lag += 1
@@ -304,6 +309,7 @@ def _compare_lag(cycle: Record) -> None:
         cycle.compares_lag = False
     else:
         correct(lagging, cycle.oriented)
+        correct(losing, cycle.oriented)
 
 
 @compiled
@@ -385,8 +391,10 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     predict(estimator, sent)
     if begins_lag:
         start_lagging(cycle.lagging[0], sent)
+        cycle.losing[0] = estimator
     elif cycle.compares_lag:
         predict(cycle.lagging[0], sent)
+        predict(cycle.losing[0], sent)
     cycle.force_applied = acting_force(estimator)
     if due:
         set_applied_force(wall, sent)

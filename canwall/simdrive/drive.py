@@ -391,7 +391,9 @@ class SimulatedDrive:
         """Let the target torque hold from now on."""
         self._pds.apply_torque(self._fields.passed)
         self._fields.passed = 0.0
-        if not self._actuator.direct:
+        if self._pds.motor_free:
+            self._pds.show_torque(0.0)  # the power stage is off, whatever was latched before
+        elif not self._actuator.direct:
             self._pds.show_torque(self._actuator.torque_nm(self._pds.torque_nm))
 
     def _go_on_without_sync(self, dt: float) -> None:

@@ -34,7 +34,7 @@ NAMED = {
     "counts": ("1", "encoder increments per turn, 0x608F"),
     "torque_step": ("N*m", "a thousandth of the rated torque, 0x6076"),
     "operator": ("", "operator at the handle"),
-    "model": ("", "model of the laws: matched, drive, file"),
+    "model": ("", "model of the laws: matched (it does not adapt), drive, file"),
     "model_error": ("1", "relative error of the model's inertia"),
     "servo": ("", "file: as configured; ideal: as with simulation.ideal; 1600Hz, 800Hz: real ones"),
     "friction": ("N*m", "Coulomb friction; 1.5 times as much holds at rest"),
@@ -185,6 +185,10 @@ def settings_at(base: Settings, point: Point) -> Settings:
         settings = settings.with_ideal_servo()
     model = law_model(settings, str(values["model"]), float(values["model_error"]))
     settings = settings.model_copy(update={"mechanics": model})
+    if values["model"] == "matched" and "operator.adapt" not in keys:
+        # It knows the operator already.
+        operator = settings.operator.model_copy(update={"adapt": False})
+        settings = settings.model_copy(update={"operator": operator})
     settings = _with_keys(settings, {k: v for k, v in keys.items() if _of_the_model(k)})
     settings = _with_known_delay(settings, float(values["delay_error"]))
     strike = (float(values[n]) for n in ("speed", "phase", "start", "press", "press_torque"))

@@ -171,12 +171,29 @@ def make_plan(base: Settings, given: Mapping[str, object], through: str = "sim")
     stiffness, damping = pop(STIFFNESS), pop(DAMPING)
     speed, phase = axes.pop("speed"), axes.pop("phase")
     assert damping is not None
+    base = _without_what_is_swept(base, stiffness, damping)
     law = axes.pop("law")
     plan = Plan(base, (law, *axes.values()), stiffness, damping, speed, phase, through)
     if plan.point_count > _MOST_POINTS:
         raise InputError(f"sweep axes: {plan.point_count} points; {_MOST_POINTS} at most")
     _check_values(plan)
     return plan
+
+
+def _without_what_is_swept(
+    base: Settings, stiffness: SweepAxis | None, damping: SweepAxis
+) -> Settings:
+    """Return the settings without what would take the place of the swept values.
+
+    That is a damping ratio where dampings are given, and a cap where the largest stiffness is
+    searched.
+    """
+    update: dict[str, None] = {}
+    if any(damping.values):
+        update["damping_ratio"] = None
+    if stiffness is None:
+        update["cap"] = None
+    return base.model_copy(update={"wall": base.wall.model_copy(update=update)})
 
 
 def _check_values(plan: Plan) -> None:

@@ -17,7 +17,7 @@ stiffness of a spring that is passive with this delay (theory, section 6).
 import math
 
 from canwall.compiled import Record, compiled
-from canwall.walls.interface import law
+from canwall.walls.interface import sampled_law
 
 #: damping: that of the device, 0: of the model; delay: periods from a sample to its force, 0: that
 #: of the paper.
@@ -34,7 +34,7 @@ def largest_force(force: float, moved: float, c1: float, c2: float) -> float:
     return math.sqrt(max(square, 0.0))
 
 
-@law
+@sampled_law
 def energy_bounding(wall: Record) -> float:
     """F = −K·y[j] − B·ẏ[j] inside, no further from 0 than `largest_force`."""
     memory = wall.memory

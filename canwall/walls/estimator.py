@@ -360,12 +360,27 @@ def end_lag(estimator: Record) -> None:
 
 
 @compiled
-def surprise(estimator: Record, y_sample: float) -> float:
-    """Return the negative logarithm of a sample's likelihood, bounded; call before `correct`."""
+def likelier(one: Record, other: Record, y_sample: float) -> float:
+    """Return by how much a sample is likelier for one estimator than for the other, bounded.
+
+    It is the difference of their logarithmic likelihoods, with the larger variance of both: an
+    estimator that has lost a sample is not the less likely for being less certain, which would
+    decide where the handle stands still. Call before `correct`.
+    """
+    variance = max(_sample_variance(one), _sample_variance(other))
+    return _misfit(other, y_sample, variance) - _misfit(one, y_sample, variance)
+
+
+@compiled
+def _sample_variance(estimator: Record) -> float:
     p = estimator.steady_covariance if estimator.settled else estimator.covariance
-    variance = p[0, 0] + _QUANTISATION
-    innovation = (y_sample - estimator.y) / estimator.scale[0]
-    return 0.5 * (min(innovation * innovation / variance, _IMPOSSIBLE) + math.log(variance))
+    return (p[0, 0] + _QUANTISATION) * estimator.scale[0] ** 2
+
+
+@compiled
+def _misfit(estimator: Record, y_sample: float, variance: float) -> float:
+    innovation = y_sample - estimator.y
+    return 0.5 * min(innovation * innovation / variance, _IMPOSSIBLE)
 
 
 @compiled

@@ -7,7 +7,7 @@ One of Rosenberg's variants (section 5.2.2). K is the stiffness at the surface; 
 import math
 
 from canwall.compiled import Record
-from canwall.walls.interface import law
+from canwall.walls.interface import sampled_law
 
 #: length: depth over which the stiffness grows by a factor e.
 OPTIONS = {"length": 0.02}
@@ -16,7 +16,7 @@ OPTIONS = {"length": 0.02}
 _LARGEST_EXPONENT = 50.0
 
 
-@law
+@sampled_law
 def exponential(wall: Record) -> float:
     """F = K·L·(exp(−y[j]/L) − 1) while the sample is inside."""
     if wall.y_sample >= 0.0:

@@ -6,13 +6,13 @@ surface and releases at the depth `release`, and while the handle moves out, the
 """
 
 from canwall.compiled import Record
-from canwall.walls.interface import law
+from canwall.walls.interface import sampled_law
 
 #: softening: stiffness on the way out over K; release: depth at which the wall lets go.
 OPTIONS = {"softening": 0.8, "release": 0.0}
 
 
-@law
+@sampled_law
 def hysteresis(wall: Record) -> float:
     """F = −K·y[j] moving in, −softening·K·y[j] moving out, 0 above −release moving out."""
     if wall.y_sample >= 0.0:

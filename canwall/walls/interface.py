@@ -109,6 +109,7 @@ class Law:
     Attributes:
         name: Name in configurations and summaries.
         options: Names and defaults of what `[wall.options]` may set.
+        sampled: True if it goes by the sampled position, not by the state that a model gives.
         failure: Returns what the last call raised, empty if nothing.
     """
 
@@ -119,6 +120,7 @@ class Law:
         options: Mapping[str, float],
         cached: bool = True,
         failure: Callable[[], str] = lambda: "",
+        sampled: bool = False,
     ) -> None:
         """Declare a law; nothing is compiled yet.
 
@@ -127,6 +129,7 @@ class Law:
         """
         self.name = name
         self.options = options
+        self.sampled = sampled
         self._function = function
         self._cached = cached
         self.failure = failure
@@ -175,6 +178,11 @@ def law(function: Callable[[Any], float]) -> Law:
     if name.endswith("_deadbeat"):
         name = name.removesuffix("_deadbeat") + DEADBEAT
     return Law(name, function, function.__globals__.get("OPTIONS", {}))
+
+
+def sampled_law(function: Callable[[Any], float]) -> Law:
+    """Declare a function of this package as a law that goes by the sampled position alone."""
+    return Law(function.__name__, function, function.__globals__.get("OPTIONS", {}), sampled=True)
 
 
 @intrinsic

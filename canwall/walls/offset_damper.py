@@ -5,14 +5,14 @@ release clean; one that begins before the surface brakes the approach.
 """
 
 from canwall.compiled import Record
-from canwall.walls.interface import law
+from canwall.walls.interface import sampled_law
 from canwall.walls.standard import spring
 
 #: offset: where the damper begins, relative to the spring's surface (negative: inside).
 OPTIONS = {"offset": -0.002}
 
 
-@law
+@sampled_law
 def offset_damper(wall: Record) -> float:
     """F = −K·y[j] inside, −B·ẏ[j] below the offset."""
     force = spring(wall)

@@ -5,13 +5,13 @@ position is mostly noise; without it the damping can be higher.
 """
 
 from canwall.compiled import Record
-from canwall.walls.interface import law
+from canwall.walls.interface import sampled_law
 
 #: threshold: speed up to which nothing is damped.
 OPTIONS = {"threshold": 0.1}
 
 
-@law
+@sampled_law
 def thresholded_damper(wall: Record) -> float:
     """F = −K·y[j] − B·(ẏ[j] beyond ±threshold) while the sample is inside."""
     if wall.y_sample >= 0.0:

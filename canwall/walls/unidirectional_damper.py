@@ -4,10 +4,10 @@ One of Rosenberg's variants (section 5.2.2).
 """
 
 from canwall.compiled import Record
-from canwall.walls.interface import law
+from canwall.walls.interface import sampled_law
 
 
-@law
+@sampled_law
 def unidirectional_damper(wall: Record) -> float:
     """F = −K·y[j] − B·min(ẏ[j], 0) while the sample is inside."""
     if wall.y_sample >= 0.0:

@@ -12,7 +12,7 @@ b > 1.5·K_c·T − B_c up to K_c·T = 4·B_c (theory, section 6), so K_c = 0.8�
 """
 
 from canwall.compiled import Record, compiled
-from canwall.walls.interface import law
+from canwall.walls.interface import sampled_law
 
 #: stiffness, damping: K_c and B_c, both 0: the stiffest passive coupling; delay: D of that, 0 or
 #: more periods.
@@ -30,7 +30,7 @@ def passive_coupling(viscous: float, period: float, delay: float) -> tuple[float
     return 2.0 * viscous / (period * (1.0 + 2.0 * delay)), 0.0
 
 
-@law
+@sampled_law
 def virtual_coupling(wall: Record) -> float:
     """F = K_c·(y_t − y[j]) + B_c·(ẏ_t − ẏ[j]), y_t the tool's position."""
     memory, period, y = wall.memory, wall.period, wall.y_sample

@@ -50,8 +50,8 @@ _SHADES = {
 
 
 def _bare_drive(viscous: float, coulomb: float) -> Settings:
-    """Return config/sim.toml with an ideal servo and nobody at the handle."""
-    settings = config.load(config.shipped("config/sim.toml")).with_ideal_servo()
+    """Return config/ideal.toml with nobody at the handle."""
+    settings = config.load(config.shipped("config/ideal.toml"))
     assert settings.simulation is not None
     nobody = {key.rsplit(".")[-1]: value for key, value in OPERATORS["none"].keys.items()}
     simulation = settings.simulation.model_copy(
@@ -104,7 +104,7 @@ def draw_impedance() -> Iterator[FigurePage]:
         left.plot(found.frequency, found.impedance.real, ".-", color=colour, label=law)
         right.plot(found.frequency, found.damping, ".-", color=colour)
     frequency = columns["frequency [Hz]"]
-    simulation = config.load(config.shipped("config/sim.toml")).simulation
+    simulation = config.load(config.shipped("config/ideal.toml")).simulation
     assert simulation is not None
     ideal = _STIFFNESS - simulation.inertia_kg_m2 * (2.0 * np.pi * frequency) ** 2
     left.plot(frequency, ideal, "--", color=REFERENT, label="continuous wall")

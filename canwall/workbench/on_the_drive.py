@@ -50,9 +50,8 @@ class RecordedRun:
 
 
 def record_run() -> RecordedRun:
-    """Run config/sim.toml. Raises RunFailedError if it trips or its record is incomplete."""
-    # The source text knows no lag of the current loop.
-    settings = config.load(config.shipped("config/sim.toml")).with_ideal_servo()
+    """Run config/ideal.toml. Raises RunFailedError if it trips or its record is incomplete."""
+    settings = config.load(config.shipped("config/ideal.toml"))
     with tempfile.TemporaryDirectory() as scratch:
         result = run(settings, Path(scratch) / "run")
         if result.outcome.interrupted:

@@ -49,7 +49,7 @@ class OperatorStrike(NamedTuple):
 
 
 def strike_by(operator: str) -> OperatorStrike:
-    """Strike the wall of config/servo.toml, as stiff as _STIFFNESS, with an operator."""
+    """Strike the wall of config/sim.toml, as stiff as _STIFFNESS, with an operator."""
     settings = _struck_by(operator)
     assert settings.run.duration_s is not None
     assert settings.simulation is not None
@@ -71,7 +71,7 @@ def strike_by(operator: str) -> OperatorStrike:
 
 def _struck_by(operator: str) -> Settings:
     settings = config.load(
-        config.shipped("config/servo.toml"), {"wall.stiffness_nm_per_rad": _STIFFNESS}
+        config.shipped("config/sim.toml"), {"wall.stiffness_nm_per_rad": _STIFFNESS}
     )
     point: dict[str, Value] = {
         "operator": operator,

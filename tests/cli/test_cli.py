@@ -137,7 +137,7 @@ def bad_eds(path: Path) -> Path:
     [
         ({"cycle_s = 0.001": "cycle_s = 0"}, "bus.cycle_s: has to be greater than 0"),
         ({"node_id = 5": "node_id = 200"}, "drive.node_id: has to be less than or equal to 127"),
-        ({'law = "standard"           #': 'law = "none" #'}, "wall.law: unknown law 'none'"),
+        ({'law = "mean_force"         #': 'law = "none" #'}, "wall.law: unknown law 'none'"),
         ({"stiffness_nm_per_rad = 50.0": "stifness = 50.0"}, "wall.stifness: unknown key"),
         ({"duration_s = 4.2": "duration_s = -1"}, "run.duration_s: has to be greater than 0"),
         ({'interface = "virtual"': 'interface = "none"'}, "bus.interface = 'none'"),
@@ -226,7 +226,7 @@ def test_bad_input_in_a_process_of_its_own(tmp_path: Path) -> None:
 
 def test_bus_of_another_process_hears_nothing_of_bad_input(say: Say, tmp_path: Path) -> None:
     channel = tmp_path / "bus"
-    changes = {"/tmp/canwall.sock": str(channel), 'law = "standard"': 'law = "none"'}
+    changes = {"/tmp/canwall.sock": str(channel), 'law = "mean_force"': 'law = "none"'}
     file = config_file(tmp_path / "c.toml", changes, UNIXCAN_CONFIG)
     with can.Bus(interface="unixcan", channel=str(channel)) as bus:
         assert say("run", file, "--output", tmp_path / "run").code == 2

@@ -9,7 +9,7 @@ import pytest
 from canwall import cli, config
 from canwall.sweep import LAW_TABLES, law_tables, make_plan, read_sweep, sweep
 
-SERVO = config.shipped("config/servo.toml")
+SERVO = config.shipped("config/sim.toml")
 
 
 def rows_of(output: str) -> list[list[str]]:
@@ -25,7 +25,7 @@ def run(*arguments: object) -> int:
 
 
 def copy_of_servo(folder: Path, text: str, other: str) -> Path:
-    """config/servo.toml with another text in place of this one."""
+    """config/sim.toml with another text in place of this one."""
     file = folder / "servo.toml"
     content = SERVO.read_text().replace("../eds", str(SERVO.parents[1] / "eds"))
     file.write_text(content.replace(text, other))

@@ -30,7 +30,8 @@ def test_ideal_is_one_thing_by_key_and_by_method() -> None:
 
 
 def test_stiction_goes_with_coulomb_where_it_is_not_given() -> None:
-    assert Simulation(coulomb_nm=0.02).breakaway_nm == 0.02
+    assert Simulation(coulomb_nm=0.02).breakaway_nm == pytest.approx(0.03)
+    assert Simulation(coulomb_nm=0.02, ideal=True).breakaway_nm == 0.02
     with pytest.raises(ValidationError, match=r"stiction_nm: has to be at least coulomb_nm, 0.02"):
         Simulation(coulomb_nm=0.02, stiction_nm=0.01)
 

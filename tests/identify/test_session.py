@@ -19,15 +19,11 @@ FREE = {
     "damping_nm_s_per_rad = 0.0256": "damping_nm_s_per_rad = 0.0",
     "stiffness_nm_per_rad = 3.2": "stiffness_nm_per_rad = 0.0",
     "strikes = 4\n": "strikes = 0\n",
-    "current_bandwidth_hz = 0.0 # of the": "current_bandwidth_hz = 800.0 # of the",
-    "inertia_kg_m2 = 1.64e-4": "inertia_kg_m2 = 1.2e-4",
+    "current_bandwidth_hz = 1600.0 # of the": "current_bandwidth_hz = 800.0 # of the",
+    "inertia_kg_m2 = 1.0e-4     # operator": "inertia_kg_m2 = 1.2e-4 # operator",
 }
-#: The hand of config/sim.toml, which rests, on a handle whose [mechanics] are known.
-HELD = {
-    "strikes = 4\n": "strikes = 0\n",
-    "inertia_kg_m2 = 1.64e-4": "inertia_kg_m2 = 1.0e-4",
-    "viscous_nm_s_per_rad = 0.0261": "viscous_nm_s_per_rad = 5.0e-4",
-}
+#: The hand of config/sim.toml, which rests.
+HELD = {"strikes = 4\n": "strikes = 0\n"}
 
 
 def free_handle() -> Settings:
@@ -50,7 +46,7 @@ def test_command_finds_the_servo(tmp_path: Path) -> None:
         "inertia": 1e-4,
         "viscous": 5e-4,
         "coulomb": 0.01,
-        "delay": 1.0,
+        "delay": 1.25,  # of the bus and the drive's own cycle
         "lag": 1.0 / (2.0 * 3.14159265 * 800.0),
     }
     for name, true in truth.items():
@@ -62,7 +58,7 @@ def test_command_finds_the_servo(tmp_path: Path) -> None:
     fragment = tomllib.loads((tmp_path / "record/identify.toml").read_text())
     assert fragment["mechanics"]["inertia_kg_m2"] == pytest.approx(1e-4, rel=0.01)
     assert fragment["drive"]["current_bandwidth_hz"] == pytest.approx(800.0, rel=0.05)
-    assert 1.0 <= fragment["estimator"]["delay_cycles"] < 1.02
+    assert 1.25 <= fragment["estimator"]["delay_cycles"] < 1.27
     assert (tmp_path / "record/identify.png").stat().st_size > 10_000
     assert (tmp_path / "record/signals.parquet").exists()
 

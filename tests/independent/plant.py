@@ -220,10 +220,11 @@ class Signals:
 
 
 def prepare(keys: dict[str, Any]) -> Settings:
-    """Return the settings of config/sim.toml with these keys, without schedule."""
+    """Return the settings of config/ideal.toml with these keys, without schedule and simulation."""
     settings = config.load(
-        config.shipped("config/sim.toml"),
+        config.shipped("config/ideal.toml"),
         {
+            "simulation.ideal": False,
             "limits.torque_nm": 1.9,
             "limits.speed_rad_s": 1000.0,
             "limits.stuck_rad": 0.0,

@@ -38,7 +38,7 @@ def test_fields_of_the_file_say_unit_and_meaning() -> None:
 def test_recorded_file_says_them_too(four_strikes: Record) -> None:
     written = pq.read_schema(four_strikes.folder / "signals.parquet")
     assert written.field("y").metadata[b"unit"] == b"rad"
-    assert written.metadata[b"laws"] == b'["standard", "half_sample"]'
+    assert written.metadata[b"laws"] == b'["mean_force", "standard"]'
 
 
 def test_table_of_the_documentation() -> None:

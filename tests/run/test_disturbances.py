@@ -24,7 +24,12 @@ def wall(
     period: float, stiffness: float, hand: dict[str, float] | None = None, **overrides: Any
 ) -> tuple[Settings, int]:
     """Four strikes on one wall, and their cycles."""
-    given = {
+    # Cogging and torque steps, but no lag.
+    given: dict[str, Any] = {
+        "simulation.ideal": False,
+        "simulation.current_bandwidth_hz": 0.0,
+        "simulation.drive_cycle_s": 0.0,
+        "simulation.stiction_nm": 0.01,
         "bus.cycle_s": period,
         "wall.law": "half_sample",
         "wall.stiffness_nm_per_rad": stiffness,
@@ -165,6 +170,18 @@ def test_tpdos_that_are_in_time_again(end: float) -> None:
     quiet = simulate(settings, cycles)
     last = slice(3150, 3600)
     assert np.abs(run.rows["y_est"][last] - quiet.rows["y_est"][last]).max() < 1e-3
+
+
+@pytest.mark.parametrize("begin", [330, 700])
+def test_an_adapting_model_tells_lost_from_late(begin: int) -> None:
+    """While the hand presses, and the handle stands still: what decides is its way out."""
+    given: dict[str, Any] = {"operator.adapt": True, "mechanics.inertia_kg_m2": 1e-4}
+    settings, cycles = wall(1e-3, 50.0, **given)
+    lost = Disturbances.none(cycles)
+    lost.lost[begin] = True
+    assert simulate(settings, cycles, disturbances=lost).lag == 0
+    late = simulate(settings, cycles, disturbances=late_from(cycles, begin, cycles))
+    assert (late.trip, late.lag) == (Trip.NONE, 1)
 
 
 def test_tpdo_that_is_late_once_does_not_disturb_the_estimate() -> None:

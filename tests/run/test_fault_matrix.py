@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from canopen.profiles.p402 import State402
 from commands import Record, config_file
-from rig import SDO_REQUEST, SYNC
+from rig import IDEAL_CONFIG, SDO_REQUEST, SYNC
 
 import canwall.run.buses
 from canwall import cli, simdrive
@@ -108,11 +108,11 @@ def witnesses(monkeypatch: pytest.MonkeyPatch) -> list[Witness]:
 def run_with(folder: Path, toml: str, exchange: str) -> int:
     """Run `canwall run` in this process; return its exit code."""
     changes = {
-        'exchange = "auto" ': f'exchange = "{exchange}" ',
+        "[bus]\n": f'[bus]\nexchange = "{exchange}"\n',
         "duration_s = 4.2": f"duration_s = {DURATION_S}",
-        'law = "standard" ': 'law = "half_sample" ',
+        'law = "standard"\n': 'law = "half_sample"\n',
     }
-    file = config_file(folder / "c.toml", changes)
+    file = config_file(folder / "c.toml", changes, IDEAL_CONFIG)
     text = file.read_text().split("[[schedule]]")[0]
     file.write_text(text + toml)
     arguments = ["run", str(file), "--output", str(folder / "run")]

@@ -82,7 +82,7 @@ def test_a_quiet_run_is_quiet_with_and_without_a_referent(operator: str) -> None
 def unknown() -> tuple[pa.Table, dict[str, Any]]:
     """Record and judgement of a grip's strike on a wall that has to find it out."""
     base = config.load(
-        config.shipped("config/servo.toml"),
+        config.shipped("config/sim.toml"),
         {"wall.stiffness_nm_per_rad": 2000.0, "wall.cap": 0.5, "wall.damping_ratio": 0.5},
     )
     settings = settings_at(base, {"operator": "grip", "model": "drive", "speed": 1.0, "phase": 0.0})

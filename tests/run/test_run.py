@@ -27,7 +27,16 @@ from commands import (
     torque_is_on,
     wait_for,
 )
-from rig import RPDO1, SDO_ANSWER, SDO_REQUEST, SYNC, TPDO1, eds_with, settings_with
+from rig import (
+    RPDO1,
+    SDO_ANSWER,
+    SDO_REQUEST,
+    SIM_CONFIG,
+    SYNC,
+    TPDO1,
+    eds_with,
+    settings_with,
+)
 
 import canwall.run.buses
 import canwall.run.running
@@ -45,25 +54,32 @@ UNIXCAN_CONFIG = config.shipped("config/unixcan.toml")
 # What a run leaves
 
 
-def test_standard_chatters_and_half_sample_does_not(four_strikes: Record) -> None:
+def test_standard_chatters_and_mean_force_does_not(four_strikes: Record) -> None:
     strikes = four_strikes.summary["strikes"]
-    assert [strike["law"] for strike in strikes] == ["standard", "half_sample"] * 2
-    assert [strike["chatter"] for strike in strikes] == [True, False, True, False]
-    for standard, half_sample in ((strikes[0], strikes[1]), (strikes[2], strikes[3])):
-        assert standard["contacts"] > half_sample["contacts"] == 1
-        assert standard["energy_out_j"] > 100 * half_sample["energy_out_j"]
+    assert [strike["law"] for strike in strikes] == ["mean_force", "standard"] * 2
+    assert [strike["chatter"] for strike in strikes] == [False, True, False, True]
+    for mean_force, standard in ((strikes[0], strikes[1]), (strikes[2], strikes[3])):
+        assert standard["contacts"] > mean_force["contacts"] == 1
+        assert standard["energy_out_j"] > 100 * mean_force["energy_out_j"]
         assert standard["chatter_frequency_hz"] > 10.0
         assert "makes and breaks" in standard["chatter_reason"]
 
 
-def test_signals_are_those_of_a_wall_one_period_late(four_strikes: Record) -> None:
-    """The torque of a row is the law's at this sample, and acts from the next SYNC on."""
+def test_signals_are_those_of_a_wall_as_late_as_bus_and_drive(four_strikes: Record) -> None:
+    """The torque of a row is the law's at this sample, and acts from the next SYNC on.
+
+    The drive's own cycle and its current loop add 0.25 and 0.1 ms: of a period, that much has the
+    torque of the row before.
+    """
     law, y = four_strikes.column("law"), four_strikes.column("y")
     wanted, per_mille = four_strikes.column("force"), four_strikes.column("torque_cmd_per_mille")
     standard = (law == "standard") & (four_strikes.column("phase") == Phase.RENDERING)
     assert wanted[standard] == pytest.approx(np.maximum(-50.0 * y[standard], 0.0))
     applied, commanded = four_strikes.column("torque_applied"), four_strikes.column("torque_cmd")
-    assert np.array_equal(applied[1:], commanded[:-1])
+    older = 0.25 + 1.0 / (2.0 * math.pi * 1.6)
+    assert four_strikes.summary["delay_cycles"] == pytest.approx(1.0 + older)
+    expected = older * commanded[:-2] + (1.0 - older) * commanded[1:-1]
+    np.testing.assert_allclose(applied[2:], expected, atol=1e-12)
     nm_per_mille = four_strikes.summary["drive"]["nm_per_mille"]
     assert commanded == pytest.approx(per_mille * nm_per_mille)
     # The limit of 1.9 N·m is rounded towards zero.
@@ -75,7 +91,7 @@ def test_folder_and_summary(four_strikes: Record) -> None:
     names = {path.name for path in four_strikes.folder.iterdir()} - {"stdout.txt"}
     assert names == {"signals.parquet", "bus.log", "summary.json", "config.toml", "run.png"}
     summary = four_strikes.summary
-    assert summary["law"] == ["standard", "half_sample"]
+    assert summary["law"] == ["mean_force", "standard"]
     assert summary["stiffness"] == 50.0
     assert summary["damping"] == 0.0
     assert summary["cycle_s"] == 0.001
@@ -87,7 +103,7 @@ def test_folder_and_summary(four_strikes: Record) -> None:
         sum(strike["energy_out_j"] for strike in summary["strikes"]), rel=0.05
     )
     assert summary["chatter"] is True
-    assert summary["chatter_reason"] == summary["strikes"][0]["chatter_reason"]
+    assert summary["chatter_reason"] == summary["strikes"][1]["chatter_reason"]
     assert summary["peak_torque"] == np.abs(four_strikes.column("torque_cmd")).max()
     assert 0.0 < summary["peak_torque"] <= 1.9
     assert summary["trips"] == []
@@ -100,14 +116,14 @@ def test_folder_and_summary(four_strikes: Record) -> None:
 
 
 def test_recorded_configuration_is_the_one_that_ran(four_strikes: Record) -> None:
-    assert config.load(four_strikes.folder / "config.toml") == settings_with()
+    assert config.load(four_strikes.folder / "config.toml") == config.load(SIM_CONFIG)
 
 
 def test_table_of_strikes(four_strikes: Record) -> None:
     text = (four_strikes.folder / "stdout.txt").read_text()
     rows = [line.split() for line in text.splitlines() if line.strip()[:1].isdigit()]
-    assert [row[1] for row in rows] == ["standard", "half_sample"] * 2
-    assert [row[8] for row in rows] == ["yes,", "no"] * 2
+    assert [row[1] for row in rows] == ["mean_force", "standard"] * 2
+    assert [row[8] for row in rows] == ["no", "yes,"] * 2
     # The energy that the plain wall puts out makes it buzz, and throws the hand deeper in.
     for row, strike in zip(rows, four_strikes.summary["strikes"], strict=True):
         assert float(row[7]) == pytest.approx(strike["felt_ripple_n"], abs=0.005)

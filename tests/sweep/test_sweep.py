@@ -172,7 +172,7 @@ def test_referent_is_the_wall_in_force_for_the_mass_that_moves() -> None:
     ],
 )
 def test_numbers_of_plant_and_strike_are_axes(axis: str, values: list[object]) -> None:
-    plan = plan_of(stiffness=[20.0], **{axis: values})
+    plan = plan_of(stiffness=[20.0], **{"simulation.ideal": [False], axis: values})
     one, other = (compute_piece(plan, piece)[0, 0] for piece in range(2))
     assert one["penetration"] != other["penetration"]
 

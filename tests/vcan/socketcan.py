@@ -35,7 +35,8 @@ SLOW = {
     "stiffness_nm_per_rad = 50.0": "stiffness_nm_per_rad = 0.5",
     "hold_cycles = 2": "hold_cycles = 100",
     "ramp_cycles = 10": "ramp_cycles = 1000\nstuck_rad = 0.0\nlate_cycles = 0",
-    'law = "half_sample"': 'law = "standard"',
+    'law = "mean_force"': 'law = "standard"',
+    "cap = 0.5\n": "",
 }
 
 #: A hand that leans on the wall, until the run ends by itself.

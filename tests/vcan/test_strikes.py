@@ -26,10 +26,10 @@ def test_signals_are_those_of_the_embedded_bus(
             assert np.array_equal(one, other), name
 
 
-def test_standard_chatters_and_half_sample_does_not(strikes: Strikes) -> None:
+def test_standard_chatters_and_mean_force_does_not(strikes: Strikes) -> None:
     found = strikes.record.summary["strikes"]
-    assert [strike["law"] for strike in found] == ["standard", "half_sample"] * 2
-    assert [strike["chatter"] for strike in found] == [True, False, True, False]
+    assert [strike["law"] for strike in found] == ["mean_force", "standard"] * 2
+    assert [strike["chatter"] for strike in found] == [False, True, False, True]
 
 
 def test_candump_has_the_record_frame_by_frame(strikes: Strikes) -> None:

@@ -125,7 +125,11 @@ def test_lost_samples_do_not_change_the_mass() -> None:
 
 
 def test_drive_cycle_and_lag_belong_to_the_delay() -> None:
-    keys = {"drive.drive_cycle_s": 0.00025, "drive.current_bandwidth_hz": 1600.0}
+    keys = {
+        "simulation.ideal": False,
+        "drive.drive_cycle_s": 0.00025,
+        "drive.current_bandwidth_hz": 1600.0,
+    }
     assert modelled_delay(settings_with({})) == 1.0
     expected = 1.0 + 0.25 + 1000.0 / (2.0 * np.pi * 1600.0)
     np.testing.assert_allclose(modelled_delay(settings_with(keys)), expected)

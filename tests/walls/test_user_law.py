@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from bouncing import Array
 from commands import Record, command, config_file
-from rig import SIM_CONFIG
+from rig import IDEAL_CONFIG
 
 from canwall.record import Phase
 from canwall.walls import LAWS, WALL, UnknownLawError, find_law, set_plant, set_referent, wall_force
@@ -83,15 +83,15 @@ def test_ball_command_finds_the_file_from_where_it_is_called(example: str, tmp_p
 
 @pytest.mark.slow
 def test_run_finds_the_file_beside_its_configuration(example: str, tmp_path: Path) -> None:
-    (tmp_path / "sim.toml").write_text(SIM_CONFIG.read_text().partition("[[schedule]]")[0])
+    (tmp_path / "ideal.toml").write_text(IDEAL_CONFIG.read_text().partition("[[schedule]]")[0])
     config = config_file(
         tmp_path / "mine.toml",
         {
             'law = "standard"': 'law = "my_law.py:my_law"',
-            "[estimator]": "[wall.options]\ngrowth = 2.5\n\n[estimator]",
+            "[limits]": "[wall.options]\ngrowth = 2.5\n\n[limits]",
             "duration_s = 4.2": "duration_s = 0.6",
         },
-        source=tmp_path / "sim.toml",
+        source=tmp_path / "ideal.toml",
     )
     done = command("run", config, "--output", tmp_path / "run", cwd=Path("/"))
     assert (done.returncode, done.stderr) == (0, "")
