@@ -35,7 +35,7 @@ ON_A_BUSY_MACHINE = {
 }
 
 #: What a run of config/sim.toml or its like says of the strikes on the plain wall.
-GUARD_SAID = r"canwall: guard: the wall buzzed \d+ times, first at 1\.\d+ s; guard\.action = .*\n"
+GUARD_SAID = r"canwall: guard: the wall buzzed \d+ times, first at \d\.\d+ s; guard\.action = .*\n"
 
 Start: TypeAlias = Callable[..., "subprocess.Popen[str]"]
 """Starts a program that is ended with the test: arguments of its command line."""
