@@ -381,6 +381,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     force = 0.0
     if active:
         force = _wanted_force(cycle, received, due)
+    demanded = 0.0 if cycle.bank[0].regression[0].probing else force
     per_mille = to_per_mille(cycle.orientation * force, cycle.nm_per_mille, cycle.torque_limit)
     torque = per_mille * cycle.nm_per_mille
     sent = cycle.orientation * torque
@@ -395,10 +396,13 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     elif cycle.compares_lag:
         predict(cycle.lagging[0], sent)
         predict(cycle.losing[0], sent)
-    cycle.force_applied = acting_force(estimator)
+    applied = acting_force(estimator, estimator.in_flight)
+    probes = cycle.bank[0].regression[0].probes
+    # What shows who is coming is no force of the wall.
+    cycle.force_applied = applied - acting_force(estimator, probes)
     if due:
-        set_applied_force(wall, sent)
-        set_applied_force(cycle.faded[0].wall[0], sent)
+        set_applied_force(wall, sent - probes[0])
+        set_applied_force(cycle.faded[0].wall[0], sent - probes[0])
     cycle.torque_per_mille = per_mille
 
     row.j = cycle.j
@@ -413,10 +417,10 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     row.y_est = wall.y
     row.v_est = wall.v
     row.d_est = wall.d
-    row.force = force
+    row.force = demanded
     row.torque_cmd_per_mille = per_mille
     row.torque_cmd = torque
-    row.torque_applied = cycle.orientation * cycle.force_applied
+    row.torque_applied = cycle.orientation * applied
     row.torque_actual = cycle.torque_actual * cycle.nm_per_mille
     row.force_applied = cycle.force_applied
     row.law = rendered.law

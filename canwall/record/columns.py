@@ -68,7 +68,7 @@ COLUMNS = (
     Column("torque_cmd", "f8", "N·m", "the same as torque, drive's axis"),
     Column("torque_actual", "f8", "N·m", "torque actual value, 0x6077, drive's axis"),
     Column("torque_applied", "f8", "N·m", "torque in force until the next SYNC, drive's axis"),
-    Column("force_applied", "f8", "N·m", "the same as force, positive out of the wall"),
+    Column("force_applied", "f8", "N·m", "the wall's force then, out of it; without a probe"),
     Column("law", "u1", "", "law of the wall", names_law=True),
     Column("stiffness", "f8", "N·m/rad", "stiffness of the wall, as asked"),
     Column("damping", "f8", "N·m·s/rad", "damping of the wall, in force"),

@@ -24,6 +24,7 @@ from canwall.walls.regression import (
     lightness,
     predict_regression,
     probe,
+    put_probe_in_flight,
     reset_regression,
     set_regression,
 )
@@ -251,6 +252,7 @@ def predict_bank(bank: Record, estimator: Record, force: float) -> None:
     older = estimator.in_flight[n]
     newer = force if n == 0 else estimator.in_flight[n - 1]
     predict_regression(bank.regression[0], older, newer)
+    put_probe_in_flight(bank.regression[0], force)
     state, phi = bank.state, bank.phi
     for i in range(bank.count):
         y, v, d = state[0, i], state[1, i], state[2, i]

@@ -399,11 +399,14 @@ def predict_open_loop(estimator: Record, force: float) -> None:
 
 
 @compiled
-def acting_force(estimator: Record) -> float:
-    """Return the mean force from this sample to the next; call after `predict`."""
+def acting_force(estimator: Record, in_flight: NDArray[np.float64]) -> float:
+    """Return the mean from this sample to the next of forces in flight; call after `predict`.
+
+    in_flight: as `ESTIMATOR` has them, newest first, or a part of them.
+    """
     n = estimator.delay_periods
     share = estimator.before[0].duration / estimator.full[0].duration
-    force = estimator.in_flight[n]
+    force = in_flight[n]
     if share > 0.0:
-        force = share * estimator.in_flight[n + 1] + (1.0 - share) * force
+        force = share * in_flight[n + 1] + (1.0 - share) * force
     return force

@@ -41,6 +41,8 @@ REGRESSION = np.dtype(
         ("steady", "i8"),  # samples in a row that moved on in one direction
         ("probe", "f8"),  # torque before a contact [N·m]
         ("probed", "i8"),  # samples of the present probe
+        ("probing", "?"),  # the force of this cycle is a probe's
+        ("probes", "f8", (MAX_DELAY + 1,)),  # torques of probes in flight, newest first
     ],
     align=True,
 )
@@ -111,7 +113,7 @@ def _observer_gain(period: float) -> NDArray[np.float64]:
 
 def reset_regression(regression: np.void, y: float) -> None:
     """Begin at rest at y, with nothing known of the mass."""
-    for name in ("observed", "information", "way", "steady", "probed"):
+    for name in ("observed", "information", "way", "steady", "probed", "probing", "probes"):
         regression[name] = 0
     regression["observed"][0, 0] = y
     regression["samples"] = y
@@ -281,4 +283,14 @@ def probe(regression: Record, wall: Record) -> float:
     # The first half is half as long: the handle is pushed about its own path.
     swing = (regression.probed + _PROBE_SAMPLES // 2) // _PROBE_SAMPLES
     regression.probed += 1
+    regression.probing = True
     return regression.probe if swing % 2 == 0 else -regression.probe
+
+
+@compiled
+def put_probe_in_flight(regression: Record, force: float) -> None:
+    """Note the part of a probe in the force that is sent, as it is rounded."""
+    for age in range(MAX_DELAY, 0, -1):
+        regression.probes[age] = regression.probes[age - 1]
+    regression.probes[0] = force if regression.probing else 0.0
+    regression.probing = False
