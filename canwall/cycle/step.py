@@ -159,7 +159,8 @@ def _faded_force(cycle: Record, force: float) -> float:
     before = _force_of(cycle, faded, due)
     share = cycle.fade_left / (cycle.fade_cycles + 1.0)
     cycle.fade_left -= 1
-    if force == 0.0 and before == 0.0:
+    outside = faded.wall[0].y_sample >= 0.0 and cycle.rendered[0].wall[0].y_sample >= 0.0
+    if outside and force == 0.0 and before == 0.0:
         cycle.fade_left = 0
     return force + share * (before - force)
 
