@@ -125,12 +125,12 @@ def test_table_of_strikes(four_strikes: Record) -> None:
     text = (four_strikes.folder / "stdout.txt").read_text()
     rows = [line.split() for line in text.splitlines() if line.strip()[:1].isdigit()]
     assert [row[1] for row in rows] == ["mean_force", "standard"] * 2
-    assert [row[8] for row in rows] == ["no", "yes,"] * 2
+    assert [row[10] for row in rows] == ["no", "yes,"] * 2
     # The energy that the plain wall puts out makes it buzz, and throws the hand deeper in.
     for row, strike in zip(rows, four_strikes.summary["strikes"], strict=True):
-        assert float(row[7]) == pytest.approx(strike["felt_ripple_n"], abs=0.005)
+        assert float(row[9]) == pytest.approx(strike["felt_ripple_n"], abs=0.005)
         deeper = strike["first_depth_rad"] / strike["referent_first_depth_rad"]
-        assert float(row[5]) == pytest.approx(deeper, abs=0.005)
+        assert float(row[7]) == pytest.approx(deeper, abs=0.005)
     assert f"record: {four_strikes.folder}" in text
 
 

@@ -114,12 +114,12 @@ def test_k_limits_over_the_rate(tmp_path: Path, drawn: dict[str, Figure]) -> Non
     for law in ("standard", "midpoint"):
         shown = line(figure, 0, law)
         np.testing.assert_array_equal(shown[:, 0], [400, 700, 1000])
-        worst = dataset["worst"].sel(law=law).squeeze() / 1.64e-4 / dataset["rate"] ** 2
+        worst = dataset["worst"].sel(law=law).squeeze() / 2.28e-4 / dataset["rate"] ** 2
         np.testing.assert_allclose(shown[:, 1], worst)
     linear = line(figure, 0, "spring and damper, linear, exact")
     for rate, limit in linear:
-        exact = stable_stiffness(1.64e-4, 0.0261, 0.0, 1.0 / rate, 1)
-        assert limit == pytest.approx(exact / 1.64e-4 / rate**2, rel=1e-3)
+        exact = stable_stiffness(2.28e-4, 0.0261, 0.0, 1.0 / rate, 1)
+        assert limit == pytest.approx(exact / 2.28e-4 / rate**2, rel=1e-3)
 
 
 @pytest.mark.slow
