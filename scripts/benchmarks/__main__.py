@@ -16,7 +16,7 @@ from on_the_bus import exchange, simulated_drive, whole_loop
 from on_the_clock import several_drives, sync_jitter
 from on_the_drive import endurance
 from on_the_socket import full_cycles, round_trip, round_trip_on_vcan0, under_python
-from on_the_sweep import closed_loop, safeguards, sweep_on_two_cores
+from on_the_sweep import closed_loop, safeguards, sweep_on_two_cores, unknown_hand
 from ways_out import ways_out
 
 Benchmark: TypeAlias = Callable[[], dict[str, Any]]
@@ -35,6 +35,7 @@ BENCHMARKS: dict[str, Benchmark] = {
     "ball": ball,
     "closed_loop": closed_loop,
     "safeguards": safeguards,
+    "unknown_hand": unknown_hand,
     "sweep_on_two_cores": sweep_on_two_cores,
 }
 ON_REQUEST: dict[str, Benchmark] = {

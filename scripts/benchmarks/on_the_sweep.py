@@ -26,8 +26,8 @@ from canwall.sweep.workers import compute_pieces
 
 #: Periods of one strike.
 _STRIKE = 1000
-#: Turns of a ratio.
-_RATIOS = 15
+#: Turns of a ratio, and strikes in each.
+_RATIOS, _TURNS = 15, 300
 
 
 def _plan(**axes: Any) -> Plan:
@@ -59,6 +59,30 @@ def closed_loop() -> dict[str, Any]:
         "periods_per_s": found,
         "plain_python_periods_per_s": round(plain),
         "half_sample_over_plain_python": round(found["half_sample"] / plain, 1),
+    }
+
+
+def unknown_hand() -> dict[str, Any]:
+    """Time per period of the loop in memory on a servo, with what an unknown hand takes; in turns.
+
+    By the processor's time, in µs: midpoint, a law of a few multiplications, alone, and mean_force
+    with the operator identified and the guard; the difference is what they take in the cycle.
+    """
+    servo = {"servo": "1600Hz", "model": "drive"}
+    without = _loop("midpoint", operator="grip", **servo)
+    having = _loop("mean_force", guard="act", adapt=True, operator="grip", **servo)
+    without(), having()
+    found = [
+        [1e6 * _computed(work) / (_TURNS * _STRIKE) for work in (without, having)]
+        for _ in range(_RATIOS)
+    ]
+    return {
+        "loop_with_midpoint_us": round(statistics.median(pair[0] for pair in found), 2),
+        "loop_with_all_us": round(statistics.median(pair[1] for pair in found), 2),
+        "identification_guard_and_law_us": round(
+            statistics.median(pair[1] - pair[0] for pair in found), 2
+        ),
+        "aim": "<= 2 us; 1e6 periods/s and core",
     }
 
 
@@ -110,9 +134,9 @@ def _computed(work: Callable[[], object]) -> float:
 
 
 def _loop(
-    law: str, guard: str = "off", adapt: bool = False, lost: float = 0.0
+    law: str, guard: str = "off", adapt: bool = False, lost: float = 0.0, **axes: Any
 ) -> Callable[[], object]:
-    settings = _struck(law)
+    settings = _struck(law, **axes)
     given = settings.guard.model_copy(update={"action": guard})
     operator = settings.operator.model_copy(update={"adapt": adapt})
     settings = settings.model_copy(update={"guard": given, "operator": operator})
@@ -122,7 +146,7 @@ def _loop(
     into = records, 50.0, 0.0, np.zeros(1, ROW), np.empty((SIGNALS, _STRIKE))
 
     def strikes() -> None:
-        for _ in range(300):
+        for _ in range(_TURNS):
             simulate_wall(*into)
 
     return strikes
@@ -151,8 +175,8 @@ def _embedded(supervised: bool) -> None:
             loop.leave()
 
 
-def _struck(law: str) -> Any:
-    plan = _plan(law=law, stiffness=[50.0], speed=[1.0], phase=[0.0])
+def _struck(law: str, **axes: Any) -> Any:
+    plan = _plan(law=law, stiffness=[50.0], speed=[1.0], phase=[0.0], **axes)
     return plan.settings(plan.points[0], plan.strikes[0])
 
 
