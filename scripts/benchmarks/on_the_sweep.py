@@ -65,11 +65,11 @@ def closed_loop() -> dict[str, Any]:
 def unknown_hand() -> dict[str, Any]:
     """Time per period of the loop in memory on a servo, with what an unknown hand takes; in turns.
 
-    By the processor's time, in µs: midpoint, a law of a few multiplications, alone, and mean_force
+    By the processor's time, in µs: half_sample, a law of a few multiplications, alone, and mean_force
     with the operator identified and the guard; the difference is what they take in the cycle.
     """
     servo = {"servo": "1600Hz", "model": "drive"}
-    without = _loop("midpoint", operator="grip", **servo)
+    without = _loop("half_sample", operator="grip", **servo)
     having = _loop("mean_force", guard="act", adapt=True, operator="grip", **servo)
     without(), having()
     found = [
@@ -77,7 +77,7 @@ def unknown_hand() -> dict[str, Any]:
         for _ in range(_RATIOS)
     ]
     return {
-        "loop_with_midpoint_us": round(statistics.median(pair[0] for pair in found), 2),
+        "loop_with_half_sample_us": round(statistics.median(pair[0] for pair in found), 2),
         "loop_with_all_us": round(statistics.median(pair[1] for pair in found), 2),
         "identification_guard_and_law_us": round(
             statistics.median(pair[1] - pair[0] for pair in found), 2
