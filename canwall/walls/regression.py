@@ -276,7 +276,7 @@ def probe(regression: Record, wall: Record) -> float:
 
     To be called while the wall gives no force.
     """
-    comes = -wall.v * regression.period >= _LEAST_WAY * regression.resolution
+    comes = -regression.way >= _LEAST_WAY * regression.resolution
     if not (comes and 0.0 < wall.y <= -wall.v * _PROBE_S):
         regression.probed = 0
         return 0.0

@@ -84,9 +84,9 @@ def test_axes_have_titles_and_units(figure: Figure) -> None:
     assert len(axes) == 7
     for one in axes:
         assert "[" in one.get_ylabel()
-    for one in axes[2:6]:  # the first two share the third's, and so does the last
+    for one in (axes[2], *axes[4:]):  # the first two and the mass share the third's
         assert "[" in one.get_xlabel()
-    close_ups = [one.get_title(loc="left") for one in axes[3:5]]
+    close_ups = [one.get_title(loc="left") for one in axes[4:6]]
     assert close_ups == ["First contact: mean_force", "First contact: standard"]
 
 
@@ -106,7 +106,7 @@ def test_signals_are_drawn_as_recorded(figure: Figure, four_strikes: Record) -> 
     assert np.array_equal(np.asarray(torque.get_ydata()), four_strikes.column("torque_applied"))
     # The close-up is of a contact with the plain wall: the penetration crosses zero, and the force
     # follows it.
-    close_up = figure.get_axes()[4]
+    close_up = figure.get_axes()[5]
     penetration, held = (np.asarray(line.get_ydata(), dtype=float) for line in close_up.lines[:2])
     assert penetration.min() < 0.0 < penetration.max()
     # It is late by the delay of bus and drive, more than one period.

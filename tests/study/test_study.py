@@ -91,7 +91,7 @@ def people() -> Iterator[list[Person]]:
 def test_a_staircase(folder: Path, people: list[Person]) -> None:
     person = Person(
         *("staircase", folder, "--law", "standard", "--seconds", ONE),
-        *("--start", 20, "--ceiling", 60, "--finest", 2),
+        *("--start", 10, "--ceiling", 40, "--finest", 2),
     )
     people.append(person)
     asked = []
@@ -100,11 +100,11 @@ def test_a_staircase(folder: Path, people: list[Person]) -> None:
             asked.append(float(re.findall(r"K = (\S+) N·m/rad", said)[0]))
             person.type("")
         else:
-            person.type("y" if asked[-1] < 25.0 else "n")
+            person.type("y" if asked[-1] < 15.0 else "n")
     assert person.end() == (0, "", "")
-    assert asked == [20, 40]
-    assert re.search(r"standard │ +20 N·m/rad │ +40 N·m/rad", said)
-    assert [v["run"] for v in person.verdicts] == ["01-K20", "02-K40"]
+    assert asked == [10, 20]
+    assert re.search(r"standard │ +10 N·m/rad │ +20 N·m/rad", said)
+    assert [v["run"] for v in person.verdicts] == ["01-K10", "02-K20"]
     assert [v["free_of_chatter"] for v in person.verdicts] == ["True", "False"]
     for verdict in person.verdicts:
         record = Record(folder / verdict["run"])

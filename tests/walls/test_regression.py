@@ -105,6 +105,7 @@ def test_probe_is_shortly_before_a_contact_only() -> None:
 
     def probed(y: float, v: float) -> float:
         wall["y"], wall["v"] = y, v
+        regression["way"] = PERIOD * v
         return float(probe(regression[0], wall[0]))
 
     assert probed(0.05, -0.5) == 0.0  # 100 ms away
