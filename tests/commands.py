@@ -151,8 +151,9 @@ def wait_for(condition: Callable[[], bool]) -> None:
 
 
 def torque_is_on(bus_log: Path) -> bool:
-    """Return True once the log has an RPDO with a torque."""
-    return any(word[8:12] != b"0000" for word in _enabling_rpdos(bus_log))
+    """Return True once the log has an RPDO with a torque of the wall; that of a probe is 8 ‰."""
+    sent = (bytes.fromhex(word[8:12].decode()) for word in _enabling_rpdos(bus_log))
+    return any(abs(int.from_bytes(torque, "little", signed=True)) > 16 for torque in sent)
 
 
 def is_enabled(bus_log: Path) -> bool:

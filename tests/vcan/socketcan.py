@@ -37,7 +37,7 @@ SLOW = {
     "hold_cycles = 2": "hold_cycles = 100",
     "ramp_cycles = 10": "ramp_cycles = 1000\nstuck_rad = 0.0\nlate_cycles = 0",
     'law = "mean_force"': 'law = "standard"',
-    "cap = 0.5\n": "",
+    "cap = 0.8\n": "",
 }
 
 #: A hand that leans on the wall, until the run ends by itself.
