@@ -58,6 +58,13 @@ def ripple(frequency: float, amplitude: float, decay_s: float = math.inf) -> Arr
     return np.asarray(0.15 + amplitude * np.exp(-t / decay_s) * np.sin(2.0 * np.pi * frequency * t))
 
 
+@pytest.mark.parametrize("period", [0.025, 0.05])
+def test_slow_cycle_has_no_felt_band(period: float) -> None:
+    record = made(period=period)
+    forces = np.random.default_rng(0).normal(size=500)
+    assert (watched(record, np.full(500, -0.01), forces) == 1.0).all()
+
+
 @pytest.mark.parametrize("frequency", [65.0, 120.0, 260.0, 430.0])
 def test_ripple_that_stays(frequency: float) -> None:
     inside = np.full(600, -0.01)
