@@ -6,7 +6,6 @@ mass that really moves. What a law makes of the wall that takes it for another o
 difference from the referent.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +13,15 @@ from numpy.typing import NDArray
 
 from canwall.analysis.felt import mean_hand_force
 from canwall.compiled import Record, compiled
-from canwall.physics import Force, Grasp, HandBody, advance, advance_grasp
+from canwall.physics import (
+    Force,
+    Grasp,
+    HandBody,
+    advance,
+    advance_grasp,
+    capped_stiffness,
+    damping_of_ratio,
+)
 
 Array = NDArray[np.float64]
 
@@ -78,12 +85,8 @@ def wall_aimed_at(asked: AskedWall, j: int, mass: float, period: float) -> tuple
         mass: m, inertia of everything that moves [kg·m²].
         period: T [s].
     """
-    stiffness, damping = asked.stiffness[j], asked.damping[j]
-    if asked.cap[j] > 0.0:
-        stiffness = min(stiffness, asked.cap[j] * mass / (period * period))
-    if asked.damping_ratio[j] > 0.0:
-        damping = 2.0 * asked.damping_ratio[j] * math.sqrt(stiffness * mass)
-    return stiffness, damping
+    stiffness = capped_stiffness(asked.stiffness[j], asked.cap[j], mass, period)
+    return stiffness, damping_of_ratio(asked.damping[j], asked.damping_ratio[j], stiffness, mass)
 
 
 @compiled

@@ -173,15 +173,18 @@ def measure_strike(
 
 
 @compiled
-def _count_contacts(y: Array, force: Array) -> tuple[int, int, int]:
-    """Return the first cycle of contact, the one after the last, and the number of contacts.
+def _touches(y: float, force: float) -> bool:
+    """Return True in contact, as `metrics.contacts` defines it."""
+    return y < 0.0 or force != 0.0
 
-    Contact is defined as in `metrics.contacts`.
-    """
+
+@compiled
+def _count_contacts(y: Array, force: Array) -> tuple[int, int, int]:
+    """Return the first cycle of contact, the one after the last, and the number of contacts."""
     first = after = contacts = 0
     touching = False
     for j in range(len(y)):
-        touches = y[j] < 0.0 or force[j] != 0.0
+        touches = _touches(y[j], force[j])
         if touches and not touching:
             first = j if contacts == 0 else first
             contacts += 1
@@ -194,11 +197,11 @@ def _count_contacts(y: Array, force: Array) -> tuple[int, int, int]:
 def pressed_cycle(y: Array, force: Array) -> int:
     """Return the cycle in which a wall is known best: the last of `judged_part`, longest contact.
 
-    There the hand presses, and is not yet leaving. Contact is defined as in `metrics.contacts`.
+    There the hand presses, and is not yet leaving.
     """
     start = best_start = best_stop = 0
     for j in range(len(y)):
-        if not (y[j] < 0.0 or force[j] != 0.0):
+        if not _touches(y[j], force[j]):
             start = j + 1
         elif j + 1 - start > best_stop - best_start:
             best_start, best_stop = start, j + 1
@@ -208,10 +211,10 @@ def pressed_cycle(y: Array, force: Array) -> int:
 
 @compiled
 def least_in_contact(y: Array, force: Array, values: Array) -> float:
-    """Return the least of the values during contact, as `metrics.contacts` defines it."""
+    """Return the least of the values during contact."""
     least = math.inf
     for j in range(len(y)):
-        if y[j] < 0.0 or force[j] != 0.0:
+        if _touches(y[j], force[j]):
             least = min(least, values[j])
     return least
 

@@ -22,7 +22,7 @@ _IDEAL: dict[str, Any] = {
 }
 
 #: Stiction over Coulomb friction, where it is not given.
-_BREAKAWAY = 1.5
+BREAKAWAY = 1.5
 
 
 class Simulation(Section):
@@ -109,7 +109,7 @@ class Simulation(Section):
         """Torque that sets the handle in motion from rest."""
         if self.stiction_nm is not None:
             return self.stiction_nm
-        return self.coulomb_nm if self.ideal else _BREAKAWAY * self.coulomb_nm
+        return self.coulomb_nm if self.ideal else BREAKAWAY * self.coulomb_nm
 
     def with_ideal_servo(self) -> Self:
         """Return the same mechanics with an ideal motor and drive, as `ideal` makes them."""

@@ -9,6 +9,7 @@ from canwall.physics.motion import MAX_EVENTS, PLANT, advance, contact_end, make
 from canwall.physics.oscillator import acceleration, basis, flow, zoh, zoh_coefficients
 from canwall.physics.shaft import SHAFT, TwoMasses, advance_shaft, make_shaft
 from canwall.physics.smooth import Force
+from canwall.physics.wall import capped_stiffness, damping_of_ratio
 
 __all__ = [
     "MAX_EVENTS",
@@ -23,7 +24,9 @@ __all__ = [
     "advance_grasp",
     "advance_shaft",
     "basis",
+    "capped_stiffness",
     "contact_end",
+    "damping_of_ratio",
     "flow",
     "make_plant",
     "make_shaft",

@@ -46,9 +46,11 @@ def summarise(
     rendering = numbers(signals, "phase") == Phase.RENDERING
     work = metrics.energy_out(y, force)
     touched = metrics.contacts(np.where(rendering, y, np.inf), force)
+    names = ("stiffness_in_force", "mass_est", "mass_spread")
+    in_force = {name: numbers(signals, name) for name in names}
     strikes = [
         _strike(strike, y, force, work, stiffness, laws, settings, units, referent, referent_felt)
-        | _in_force(strike, y, force, signals)
+        | _in_force(strike, y, force, in_force)
         for strike in metrics.strikes(touched, settings.bus.cycle_s, _changes(signals))
     ]
     chattering = [s for s in strikes if s["chatter"]]
@@ -146,18 +148,18 @@ def _strike(
 
 
 def _in_force(
-    strike: metrics.StrikeContacts, y: Array, force: Array, signals: "pa.Table"
+    strike: metrics.StrikeContacts, y: Array, force: Array, in_force: dict[str, Array]
 ) -> dict[str, Any]:
     """Return what the cycle made of the wall that was asked for, and of the operator."""
-    stiffness = numbers(signals, "stiffness_in_force")
+    stiffness = in_force["stiffness_in_force"]
     last = strike.cycles.start + pressed_cycle(y[strike.cycles], force[strike.cycles])
     return {
         "stiffness_in_force": float(stiffness[last]),
         "stiffness_in_force_least": least_in_contact(
             y[strike.cycles], force[strike.cycles], stiffness[strike.cycles]
         ),
-        "mass_est_kg_m2": float(numbers(signals, "mass_est")[last]),
-        "mass_spread": float(numbers(signals, "mass_spread")[last]),
+        "mass_est_kg_m2": float(in_force["mass_est"][last]),
+        "mass_spread": float(in_force["mass_spread"][last]),
     }
 
 

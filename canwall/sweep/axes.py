@@ -9,11 +9,12 @@ import numpy as np
 
 from canwall.config import ConfigError, Settings, with_overrides
 from canwall.config.drive import MILLI_NM
+from canwall.config.simulation import BREAKAWAY
 from canwall.cycle import with_law
 from canwall.errors import InputError
 from canwall.run.closed_loop import cached_servo_scales, loop_delay
 from canwall.simdrive import TORQUE_LIMITS
-from canwall.sweep.strike import OPERATORS, SERVOS, STICTION, law_model, strike_settings
+from canwall.sweep.strike import OPERATORS, SERVOS, law_model, strike_settings
 from canwall.walls import MAX_DELAY
 
 #: Largest number of values on one axis: more of them are a typing error.
@@ -273,7 +274,7 @@ def _with_servo(settings: Settings, name: Value) -> Settings:
 
 
 def _with_friction(settings: Settings, coulomb: Value) -> Settings:
-    keys = {"coulomb_nm": float(coulomb), "stiction_nm": STICTION * float(coulomb)}
+    keys = {"coulomb_nm": float(coulomb), "stiction_nm": BREAKAWAY * float(coulomb)}
     return with_overrides(settings, {f"simulation.{key}": value for key, value in keys.items()})
 
 

@@ -24,7 +24,7 @@ from canwall.walls import LAWS
 #: Laws with a damper: a table has them at the damping B·T/m with the largest K-limit.
 DAMPED = ("damped", "thresholded_damper", "unidirectional_damper", "offset_damper")
 #: Laws that use the sampled position alone.
-SAMPLED = ("standard", "hysteresis", "exponential", "energy_bounding", "virtual_coupling", *DAMPED)
+SAMPLED = tuple(name for name, law in LAWS.items() if law.sampled)
 DAMPINGS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
 #: A rigid stop has no stiffness to find a limit of.
 _WITH_STIFFNESS = tuple(name for name in LAWS if name != "rigid")

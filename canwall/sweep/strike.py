@@ -75,7 +75,7 @@ OPERATORS = {
 
 @dataclass(frozen=True)
 class Servo:
-    """What a servo adds to an ideal one (theory, section 8), known to the model of the laws.
+    """Lag and cycle of a servo (theory, section 8), known to the model of the laws.
 
     Attributes:
         name: Name on the axis `servo`.
@@ -100,9 +100,6 @@ class Servo:
 SERVOS = {
     servo.name: servo for servo in (Servo("1600Hz", 1600.0, 0.00025), Servo("800Hz", 800.0, 0.0004))
 }
-#: Torque at which a handle breaks away, over the Coulomb friction (theory, section 8).
-STICTION = 1.5
-
 _FIRST_STRIKE_S = 0.05
 _AFTERWARDS_S = 0.25
 #: Part of the way from the wall to a limit of position up to which a wall holds the hand.

@@ -4,7 +4,6 @@ One sign everywhere: y < 0 is inside the wall, a force f > 0 pushes the operator
 the record and returns f; it does not clamp to the drive's limits and does not round.
 """
 
-import math
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled, compiled_for_c
 from canwall.errors import InputError
-from canwall.physics import PLANT, zoh, zoh_coefficients
+from canwall.physics import PLANT, capped_stiffness, damping_of_ratio, zoh, zoh_coefficients
 
 #: Numbers that the record has room for: options of a law, and its memory.
 MAX_OPTIONS = 64
@@ -243,12 +242,10 @@ def put_in_force(wall: Record) -> None:
     stiffness = wall.asked_stiffness
     if wall.cap > 0.0:
         growth = _GROWTH_INSIDE if wall.y_sample < 0.0 else _GROWTH_OUTSIDE
-        allowed = min(stiffness, wall.cap * wall.mass / (wall.period * wall.period))
+        allowed = capped_stiffness(stiffness, wall.cap, wall.mass, wall.period)
         stiffness = min(allowed, growth * wall.stiffness)
     wall.stiffness = stiffness
-    wall.damping = wall.asked_damping
-    if wall.damping_ratio > 0.0:
-        wall.damping = 2.0 * wall.damping_ratio * math.sqrt(stiffness * wall.mass)
+    wall.damping = damping_of_ratio(wall.asked_damping, wall.damping_ratio, stiffness, wall.mass)
 
 
 @compiled
