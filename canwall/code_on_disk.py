@@ -19,7 +19,7 @@ from types import FunctionType, SimpleNamespace
 from typing import Any, TypeAlias
 
 #: Packages without compiled code, and without dtypes or constants that compiled code takes.
-_WITHOUT_COMPILED_CODE = ("bench", "cli", "config", "study")
+_WITHOUT_COMPILED_CODE = ("bench", "cli", "config", "library", "panel", "study")
 _PACKAGE = Path(__file__).resolve().parent
 
 #: Folders of other sources that are kept: those used last, and those used within this time [s].

@@ -1,6 +1,9 @@
 """The two kinds of failure that a user sees; the text of each is one short line."""
 
+import difflib
 import re
+from collections.abc import Iterable
+from typing import Any
 
 #: Longest word and longest text of a message, which may quote what it is about [characters].
 _WORD, _TEXT = 250, 1000
@@ -10,6 +13,15 @@ def one_line(text: str) -> str:
     """Return a text as a line: control characters escaped, what is too long cut in its middle."""
     printable = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
     return _cut(re.sub(r"\S+", lambda word: _cut(word[0], _WORD), printable), _TEXT)
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return the end of a message about an unknown name: the known one that is closest.
+
+    It is empty if none is close.
+    """
+    close = difflib.get_close_matches(name, list(known), n=1)
+    return f"; did you mean {close[0]}?" if close else ""
 
 
 def _cut(text: str, most: int) -> str:
@@ -32,3 +44,19 @@ class RunFailedError(Exception):
 
     def __init__(self, text: str) -> None:
         super().__init__(one_line(text))
+
+
+class TrippedError(RunFailedError):
+    """A limit ended the run; the drive is disabled.
+
+    Attributes:
+        run: The run up to then, as `canwall.run` returns it.
+    """
+
+    def __init__(self, text: str, run: Any) -> None:
+        super().__init__(text)
+        self.run = run
+
+
+class RunWarning(UserWarning):
+    """Something that a run could not complete: a part of its record, or the drive put back."""

@@ -1,7 +1,7 @@
 """Signals that request the end of a run, so that the drive is disabled first."""
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -18,17 +18,28 @@ class StopRequest:
     def __init__(self, held: bool = True) -> None:
         self.count = 0
         self.held = held
+        self._attend: Callable[[], object] = lambda: None
 
     def __call__(self) -> bool:
         """Return whether the end was requested."""
         return self.count > 0
 
-    def hold(self) -> None:
-        """Only count signals from now on, so that what ends the run is complete."""
+    def hold(self, attend: Callable[[], object]) -> None:
+        """Only count signals from now on, so that what ends the run is complete.
+
+        Args:
+            attend: Called at each signal: has the loop look at this request at once.
+        """
+        self._attend = attend
         self.held = True
 
-    def _request(self, number: int, frame: object) -> None:
+    def request(self) -> None:
+        """Request the end, as a signal does; any thread may call this."""
         self.count += 1
+        self._attend()
+
+    def _request(self, number: int, frame: object) -> None:
+        self.request()
         if not self.held:
             raise KeyboardInterrupt
 

@@ -32,13 +32,17 @@ release = version = importlib.metadata.version("canwall")
 html_title = f"canwall {version}"
 
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "svg_math",
     "generated_tables",
 ]
-exclude_patterns = ["extensions"]
+exclude_patterns = ["extensions", "**/.ipynb_checkpoints"]
+
+# Notebooks are shown as they were executed; tests/library executes them. Progress is no result.
+nb_execution_mode = "off"
+nb_output_stderr = "remove"
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 smartquotes = False

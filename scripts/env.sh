@@ -1,13 +1,15 @@
 # Sourced by the scripts beside it: a virtual environment in the checkout, made when needed.
-# `set_up_environment EXTRA` sets $root and $bin; EXTRA is empty or "[dev]".
+# `set_up_environment EXTRAS` sets $root and $bin; EXTRAS is "[plot,sweep]" or "[dev]". All versions are
+# those of constraints.txt, so that every checkout has the same.
 
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
 bin=$root/.venv/bin
 
 set_up_environment() {
   # What an environment holds is noted in it; it is made anew where the checkout was moved, and
-  # completed where pyproject.toml has changed or more is asked for than was installed.
-  state="$root $(cksum <"$root/pyproject.toml")"
+  # completed where pyproject.toml or constraints.txt have changed or more is asked for than was installed.
+  constraints=$root/scripts/constraints.txt
+  state="$root $(cat "$root/pyproject.toml" "$constraints" | cksum)"
   for extra in "[dev]" "$1"; do
     note=$root/.venv/installed$extra
     if [ -f "$note" ] && [ "$(cat "$note")" = "$state" ]; then
@@ -24,9 +26,18 @@ set_up_environment() {
     if ! [ -x "$bin/python" ] || ! "$bin/python" -c '' 2>/dev/null || ! grep -qsF "$root" "$root"/.venv/installed*; then
       "$python" -m venv --clear "$root/.venv"
     fi
-    "$bin/python" -m pip install --quiet --disable-pip-version-check --editable "$root$1" >&2
+    "$bin/python" -m pip install --quiet --disable-pip-version-check --constraint "$constraints" \
+      --editable "$root$1" >&2
     printf '%s' "$state" >"$root/.venv/installed$1"
   ) 9>"$root/.venv.lock"
+}
+
+as_root() {
+  if [ "$(id -u)" -eq 0 ]; then
+    "$@"
+  else
+    sudo -n "$@"
+  fi
 }
 
 find_python() {

@@ -35,7 +35,12 @@ ON_A_BUSY_MACHINE = {
 }
 
 #: What a run of config/sim.toml or its like says of the strikes on the plain wall.
-GUARD_SAID = r"canwall: guard: the wall buzzed \d+ times, first at \d\.\d+ s; guard\.action = .*\n"
+GUARD_SAID = (
+    r"canwall: guard: the wall buzzed (?:once|\d+ times), first at \d+\.\d+ s; guard\.action = .*\n"
+)
+
+#: What a run says that was stopped by a signal.
+STOPPED_SAID = "canwall: interrupted; the drive is disabled\n"
 
 Start: TypeAlias = Callable[..., "subprocess.Popen[str]"]
 """Starts a program that is ended with the test: arguments of its command line."""

@@ -5,23 +5,29 @@ Reports unmarked tests that are `slow` by the rule in pyproject.toml.
 
 import contextlib
 import gc
+import pickle
 import re
 import signal
 import subprocess
 import sys
 import types
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import fork_server
 import hypothesis
 import pytest
+import rig
+from canopen.objectdictionary import ObjectDictionary
 from commands import GUARD_SAID, Record, Start, installed_command
 from fork_server import PYTHON, ForkedPopen
 from rig import Rig, RigFactory
 
 import canwall.record.recorder
+from canwall.eds import load_eds
+from canwall.run import assembly
+from canwall.simdrive.communication import dictionary
 
 # A shell without job control starts what it puts into the background with SIGINT ignored, nohup
 # does so with SIGHUP, and canwall leaves it so: its tests are to mean the same there.
@@ -101,6 +107,29 @@ def _forked_writers() -> Iterator[None]:
     forking = types.SimpleNamespace(**{**vars(subprocess), "Popen": ForkedPopen})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(canwall.record.recorder, "subprocess", forking)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _dictionaries_read_once() -> Iterator[None]:
+    """Read each EDS once: most of the time that a rig takes.
+
+    Each call has a dictionary of its own.
+    """
+    read: dict[tuple[object, ...], bytes] = {}
+
+    def load_once(path: Path, node_id: int, required: Iterable[int] = ()) -> ObjectDictionary:
+        if not path.is_file():
+            return load_eds(path, node_id, required)
+        found, objects = path.stat(), tuple(required)
+        key = (path, found.st_mtime_ns, found.st_size, node_id, objects)
+        if key not in read:
+            read[key] = pickle.dumps(load_eds(path, node_id, objects))
+        return cast(ObjectDictionary, pickle.loads(read[key]))
+
+    with pytest.MonkeyPatch.context() as patch:
+        for user in (rig, assembly, dictionary):
+            patch.setattr(user, "load_eds", load_once)
         yield
 
 

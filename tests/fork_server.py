@@ -245,11 +245,11 @@ def load() -> None:
     import canwall.cli
     import canwall.record.recorder
     import canwall.record.writer
-    import canwall.run
     import canwall.study
     import canwall.sweep
     import canwall.workbench
     from canwall import config
+    from canwall.run import run
 
     forking = types.SimpleNamespace(**{**vars(subprocess), "Popen": PopenByFork})
     canwall.record.recorder.subprocess = forking  # type: ignore[attr-defined]
@@ -257,7 +257,7 @@ def load() -> None:
         given = {"run.duration_s": 0.05, "bus.exchange": exchange}
         settings = config.load(config.shipped("config/sim.toml"), given)
         with tempfile.TemporaryDirectory() as folder:
-            canwall.run.run(settings, Path(folder) / "run")
+            run(settings, Path(folder) / "run")
 
 
 def serve(requests: socket.socket) -> None:

@@ -58,7 +58,7 @@ def multiplexer(data: bytes) -> Object:
 class Tampering:
     """Stands between the bus and a drive, so that tests have drives that misbehave."""
 
-    drive: simdrive.SimulatedDrive
+    drive: simdrive.ServoDrive
     #: Values that uploads give instead of the drive's own.
     lies: dict[Object, int] = field(default_factory=dict)
     #: Values of objects that the drive does not have.
@@ -132,7 +132,7 @@ class Rig:
                 self.settings.drive, self.settings.simulation, self.settings.bus.cycle_s
             )
         )
-        self.runner = self.switch_on(cast(simdrive.SimulatedDrive, self.tampering))
+        self.runner = self.switch_on(cast(simdrive.ServoDrive, self.tampering))
         self.link = Link(self.bus, idle=self.runner.poll)
         self.link.log = self._note
         self.frames: list[tuple[int, bytes]] = []
@@ -140,7 +140,7 @@ class Rig:
         self.node = DriveNode(self.link, 5, dictionary, self.settings.drive.sdo_timeout_s)
         self.rings: list[Ring] = []
 
-    def switch_on(self, drive: simdrive.SimulatedDrive) -> simdrive.BusRunner:
+    def switch_on(self, drive: simdrive.ServoDrive) -> simdrive.BusRunner:
         """Put the drive onto its end of the bus."""
         return simdrive.BusRunner(drive, self.drive_bus)
 

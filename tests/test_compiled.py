@@ -18,8 +18,9 @@ FALL = """
 from canwall.compiled import _compiling
 missed = []
 _compiling.note_miss = lambda: missed.append(1)
-from canwall.physics import advance, make_plant
-print(advance(make_plant(2.0)[0], 1.0, 0.0, -4.0, 0.0, 1.0), end=" ")
+from canwall.physics.smooth import SmoothMotion, state_at
+falling = SmoothMotion(2.0, 0.0, 0.0, 1.0, 0.0, -4.0, 0.0, 0.0, 0.0)
+print(state_at(falling, 1.0), end=" ")
 print("compiled" if missed else "loaded")
 """
 LINE = "    a0 = (u0 - spring * y) / mass\n"
@@ -56,7 +57,7 @@ class Installation:
         return output.strip()
 
     def change(self, line: str, other: str) -> None:
-        """Exchange a line of a function that `advance` calls, in another file."""
+        """Exchange a line of a function that `state_at` calls, in another file."""
         oscillator = self.package / "physics" / "oscillator.py"
         text = oscillator.read_text()
         assert text.count(line) == 1
@@ -102,14 +103,14 @@ def test_change_in_another_file_is_noticed(
 ) -> None:
     folder = place(installation)
     kept = "compiled" if folder is None else "loaded"
-    assert installation.run() == "(0.0, -2.0, False) compiled"
-    assert installation.run() == f"(0.0, -2.0, False) {kept}"
+    assert installation.run() == "(0.0, -2.0) compiled"
+    assert installation.run() == f"(0.0, -2.0) {kept}"
     half = LINE.replace("= (", "= 0.5 * (")
     installation.change(LINE, half)
-    assert installation.run() == "(0.5, -1.0, False) compiled"
+    assert installation.run() == "(0.5, -1.0) compiled"
     # The code of other sources has been left to those who run them.
     installation.change(half, LINE)
-    assert installation.run() == f"(0.0, -2.0, False) {kept}"
+    assert installation.run() == f"(0.0, -2.0) {kept}"
     if folder is not None:
         assert len(list(folder.rglob("compiled-*"))) == 2
 
@@ -118,19 +119,19 @@ def test_change_in_another_file_is_noticed(
 def test_several_first_starts_at_once(installation: Installation) -> None:
     for process in [installation.start() for _ in range(4)]:
         output, _ = process.communicate(timeout=PATIENCE_S)
-        assert output.startswith("(0.0, -2.0, False)")
-    assert installation.run() == "(0.0, -2.0, False) loaded"
+        assert output.startswith("(0.0, -2.0)")
+    assert installation.run() == "(0.0, -2.0) loaded"
     for file in beside(installation).rglob("*-*"):
         if file.is_file():
             file.write_bytes(file.read_bytes()[:-1])
-    assert installation.run() == "(0.0, -2.0, False) compiled"
+    assert installation.run() == "(0.0, -2.0) compiled"
 
 
 @pytest.mark.slow
 def test_process_whose_sources_change_keeps_nothing(installation: Installation) -> None:
     """It may have imported a source before or after the change."""
     changing = "import canwall.physics, pathlib; pathlib.Path('canwall/units.py').touch()\n"
-    assert installation.run(changing + FALL) == "(0.0, -2.0, False) compiled"
+    assert installation.run(changing + FALL) == "(0.0, -2.0) compiled"
     assert not list(installation.package.parent.rglob("compiled-*"))
 
 

@@ -5,18 +5,18 @@ import json
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from canwall.bench.latency import Histogram, Latency, LatencyPhase
 from canwall.errors import InputError
-from canwall.figure_style import COLOURS, STYLE
+from canwall.extras import is_installed
+from canwall.figure_style import COLOURS, DPI, PAGE_IN, STYLE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 #: Width of the longest bar [characters].
 _BAR = 24
@@ -135,25 +135,30 @@ def _bin_counts(histogram: Histogram, edges: NDArray[np.float64]) -> NDArray[np.
 def write_latency(latency: Latency, folder: Path) -> list[Path]:
     """Write latency.json, latency.csv and latency.png into a folder and return their paths.
 
+    There is no picture without the packages of the extra `plot`.
+
     latency.csv has every bucket: quantity, phase, upper end [µs], cycles. It has the time from
     SYNC to RPDO instead of the margin. Raises InputError if the folder cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        paths = [folder / f"latency.{ending}" for ending in ("json", "csv", "png")]
-        text = json.dumps(_json_content(latency), indent=2, ensure_ascii=False)
+        paths = [folder / f"latency.{ending}" for ending in ("json", "csv")]
+        text = json.dumps(json_content(latency), indent=2, ensure_ascii=False)
         paths[0].write_text(text + "\n", encoding="utf-8")
         with paths[1].open("w", newline="", encoding="utf-8") as file:
             table = csv.writer(file)
             table.writerow(("quantity", "phase", "up_to_us", "cycles"))
             table.writerows(_csv_rows(latency))
-        _draw_figure(latency, paths[2])
+        if is_installed("plot"):
+            paths.append(folder / "latency.png")
+            _draw_figure(latency, paths[-1])
     except OSError as error:
         raise InputError(f"--output {folder}: {error.strerror}") from None
     return paths
 
 
-def _json_content(latency: Latency) -> dict[str, Any]:
+def json_content(latency: Latency) -> dict[str, Any]:
+    """Return the content of latency.json."""
     budget, shortest_cycle = latency.budget, latency.shortest_cycle
     return {
         "interface": latency.interface,
@@ -191,10 +196,15 @@ def _csv_rows(latency: Latency) -> Iterator[tuple[str, str, float, int]]:
 
 
 def _draw_figure(latency: Latency, path: Path) -> None:
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(12, 4.2), layout="constrained", dpi=120)
-        for axes, quantity in zip(figure.subplots(1, len(QUANTITIES)), QUANTITIES, strict=True):
+        figure = Figure(figsize=(PAGE_IN, 7.0), layout="constrained", dpi=DPI)
+        *panels, counts = figure.subplots(2, 2).ravel()
+        for axes, quantity in zip(panels, QUANTITIES, strict=True):
             _draw_panel(axes, latency, quantity)
+        _draw_missed(counts, latency)
         rate = f"{latency.cycle_s * 1e3:g} ms"
         figure.suptitle(
             f"{latency.interface} {latency.channel}, {latency.exchange}, cycle {rate}; "
@@ -206,37 +216,87 @@ def _draw_figure(latency: Latency, path: Path) -> None:
         figure.savefig(path)
 
 
-def _draw_panel(axes: Axes, latency: Latency, quantity: Quantity) -> None:
+def _styled(latency: Latency) -> Iterator[tuple[LatencyPhase, str, str]]:
+    """Yield each phase with its colour and hatch."""
+    yield from zip(latency.phases, (COLOURS[0], COLOURS[3]), ("", "///"), strict=False)
+
+
+def _draw_panel(axes: "Axes", latency: Latency, quantity: Quantity) -> None:
     """Draw the cycles per tenth of an octave, idle and under load, with their p99.9."""
-    histograms = [quantity.of(phase) for phase in latency.phases]
-    filled = [histogram for histogram in histograms if len(histogram.ends_us)]
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    filled = [h for h in map(quantity.of, latency.phases) if len(h.ends_us)]
     low = max(0.1, min((histogram.ends_us[0] for histogram in filled), default=0.1))
     high = max(low, max((histogram.max_us for histogram in filled), default=low))
     # Buckets are 1/32 to 1/64 of an octave apart, so every bin of a tenth has at least three.
     edges = low * 2.0 ** (np.arange(-1, math.ceil(10 * math.log2(high / low)) + 2) / 10)
-    for phase, histogram, colour in zip(
-        latency.phases, histograms, (COLOURS[1], COLOURS[0]), strict=False
-    ):
+    for phase, colour, hatch in _styled(latency):
+        histogram = quantity.of(phase)
         ends = np.clip(histogram.ends_us, edges[0], edges[-1])
         counts, _ = np.histogram(ends, edges, weights=histogram.counts)
-        numbers = percentiles_us(latency, quantity, phase)
-        name = f"{phase.name}, margin" if quantity.margin else phase.name
-        label = f"{name}: p50 {numbers['p50']:.0f}, p99.9 {numbers['p99.9']:.0f} µs"
-        axes.stairs(counts, edges, color=colour, label=label, fill=True, alpha=0.35)
-        axes.stairs(counts, edges, color=colour)
-        axes.axvline(histogram.p999_us, color=colour, linestyle="--", linewidth=1)
+        label = f"{phase.name}: no cycle had one"
+        if counts.any():
+            numbers = percentiles_us(latency, quantity, phase)
+            name = f"{phase.name}, margin" if quantity.margin else phase.name
+            label = f"{name}: p50 {numbers['p50']:.0f}, p99.9 {numbers['p99.9']:.0f} µs"
+            axes.axvline(histogram.p999_us, color=colour, linestyle="--", linewidth=1.2)
+        axes.stairs(
+            counts,
+            edges,
+            fill=True,
+            facecolor=(colour, 0.35),
+            edgecolor=colour,
+            hatch=hatch,
+            linewidth=1.0,
+            label=label,
+        )
+    axes.set_title(quantity.title)
+    what = "time"
     if quantity.margin:
         period_us = latency.cycle_s * 1e6
         axes.axvline(period_us, color="black", linewidth=1.5, label="the next SYNC")
-        axes.set_title("SYNC due → RPDO; the rest of the cycle is the margin")
-    else:
-        axes.set_title(quantity.title)
+        what = "from SYNC due to RPDO"
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_ylim(0.7, None)
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 100.0 * low else (1.0,)))
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_xlabel("µs (dashed: p99.9)")
-    axes.set_ylabel("cycles")
-    axes.legend(fontsize=8, frameon=True, framealpha=0.9, edgecolor="none")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
+    axes.set_xlabel(f"{what} [µs], logarithmic; dashed: p99.9")
+    axes.set_ylabel("cycles, logarithmic")
+    # Below the axes, where no peak is.
+    axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.22), borderpad=0.0)
+
+
+def _draw_missed(axes: "Axes", latency: Latency) -> None:
+    """Draw the share of cycles without a TPDO, and of those with a late RPDO."""
+    names = ("TPDO\nmissed", "RPDO after\nnext SYNC")
+    height = 0.8 / len(latency.phases)
+    for number, (phase, colour, hatch) in enumerate(_styled(latency)):
+        for row, count in enumerate((phase.missed_tpdo, phase.late_rpdo)):
+            place = row + (number - 0.5 * (len(latency.phases) - 1)) * height
+            share = 100.0 * count / max(phase.cycles, 1)
+            axes.barh(
+                place,
+                share,
+                height=0.9 * height,
+                facecolor=(colour, 0.35),
+                edgecolor=colour,
+                hatch=hatch,
+                label=phase.name if row == 0 else None,
+            )
+            axes.text(
+                min(share, 40.0) + 2.0,
+                place,
+                f"{phase.name}: {count} of {phase.cycles}",
+                va="center",
+                weight="bold" if count else "normal",
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.9},
+            )
+    axes.set_title("Missed and late frames")
+    axes.set_yticks(range(len(names)), names)
+    axes.invert_yaxis()
+    axes.set_xlim(0.0, 100.0)
+    axes.set_xlabel("share of the cycles [%], linear")
+    axes.grid(visible=False, axis="y")

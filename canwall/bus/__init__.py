@@ -8,6 +8,7 @@ descriptor for a bus. `can_ids` has the identifiers of CiA 301. Nothing here rea
 from canwall.bus.cycle_socket import CycleSocket
 from canwall.bus.errors import bus_error, explained, reason
 from canwall.bus.message import DataFrame
+from canwall.bus.opening import open_bus
 from canwall.bus.socket_pair import SocketPairBus, socket_pair
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "SocketPairBus",
     "bus_error",
     "explained",
+    "open_bus",
     "reason",
     "socket_pair",
 ]

@@ -6,24 +6,31 @@ they share.
 
 from typing import NoReturn
 
-from canwall.cli import bench, identify, run, study, sweep, workbench
+from canwall.cli import beginning, bench, export, identify, panel, run, study, sweep, workbench
 from canwall.cli.ending import INTERRUPTED, guarded
-from canwall.cli.program import make_program, run_program
+from canwall.cli.program import add_version, make_program, run_program
 
 __all__ = ["INTERRUPTED", "app", "guarded", "main", "make_program", "run_program"]
 
 app = make_program(
     no_args_is_help=True, help="A stiff virtual wall without chatter on a CANopen servo drive."
 )
+add_version(app)
 for command in (
     run.run,
     run.change,
     run.drive,
+    beginning.scan,
+    beginning.init,
+    beginning.config,
     bench.doctor,
     bench.latency,
+    bench.dbc,
     identify.identify,
     sweep.sweep,
     sweep.plot,
+    export.export,
+    panel.panel,
     workbench.ball,
     workbench.figures,
 ):

@@ -1,5 +1,6 @@
 """Commands that examine a bench before a wall is rendered on it: `doctor`, `latency`."""
 
+import dataclasses
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,46 +12,88 @@ from rich.table import Table
 from canwall.cli.ending import FAILED, StoppedError, failed_if
 from canwall.cli.options import (
     ConfigArgument,
+    ConfigFile,
     EdsOption,
+    JsonOption,
     NoWatchdogOption,
     absolute_path,
     settings_from,
 )
-from canwall.cli.output import ProgressDisplay, console, errors
+from canwall.cli.output import ProgressDisplay, console, errors, print_json, say
+from canwall.errors import ConfigError
+from canwall.extras import how_to_install, is_installed, need
 from canwall.stopping import stop_on_signals
 
 if TYPE_CHECKING:
-    from canwall.bench import Findings
+    from canwall.bench import Finding, Findings
 
 
 def doctor(
-    config_file: Annotated[Path, typer.Argument(metavar="CONFIG", help="A TOML file.")],
+    config_file: ConfigFile,
+    move: Annotated[
+        bool,
+        typer.Option("--move", help="Move the handle a little as well, from 1 % torque on."),
+    ] = False,
+    as_json: JsonOption = False,
     eds: EdsOption = None,
     accept_no_watchdog: NoWatchdogOption = False,
 ) -> int:
-    """Find the drive, show how it would be set up and why, and test its watchdog.
+    """Tell whether a bench is ready for a wall, or what has to be mended.
 
-    The drive is enabled with zero torque for the test. All changes are undone.
+    Bus, drive, file, units, limits and timing are checked, and the watchdog is tested: the drive is
+    enabled with zero torque. All changes are undone.
     """
     settings = settings_from(
         config_file,
         drive__eds=absolute_path(eds),
         drive__accept_no_watchdog=accept_no_watchdog or None,
     )
-    from canwall.bench import Findings, examine
+    from canwall.bench import Findings, diagnose
     from canwall.drive import REQUIRED_OBJECTS
-    from canwall.run import on_the_bus
 
     def announce(step: str) -> None:
         errors.print(f"doctor: {step}", markup=False)
 
     findings = Findings()
     try:
-        with on_the_bus(settings) as link:
-            examine(link, settings, REQUIRED_OBJECTS, announce, findings)
+        diagnose(settings, REQUIRED_OBJECTS, announce, findings, move)
     finally:
-        _print_findings(findings)
+        if not as_json and findings.lines:
+            _print_findings(findings)
+    if as_json:
+        lines = [dataclasses.asdict(line) for line in findings.lines]
+        print_json({"ready": findings.well, "findings": lines})
+    else:
+        _print_verdict(findings, config_file)
     return 0 if findings.well else FAILED
+
+
+def dbc(
+    config_files: Annotated[
+        list[Path], typer.Argument(metavar="CONFIG", help="TOML files, one for each drive.")
+    ],
+    output: Annotated[Path, typer.Option(metavar="FILE", help="The DBC file.")],
+) -> int:
+    """Write a DBC file: names, scales and units of the PDOs as a run maps them.
+
+    The drives are set up as for a run, but not enabled, and put back.
+    """
+    need("dbc")
+    many = [settings_from(path) for path in config_files]
+    from canwall.bench.dbc import dbc_text, mapped_drive
+    from canwall.drive import REQUIRED_OBJECTS
+    from canwall.run import on_the_bus
+
+    with on_the_bus(*many) as link:
+        drives = [mapped_drive(link, settings, REQUIRED_OBJECTS) for settings in many]
+    text = dbc_text(drives)
+    try:
+        # The encoding and the line ends of a DBC are those of Windows.
+        output.write_text(text, encoding="cp1252", errors="replace", newline="")
+    except OSError as error:
+        raise ConfigError(f"{output}: cannot be written: {error.strerror}") from None
+    console.print(f"written: {output}", soft_wrap=True, highlight=False, markup=False)
+    return 0
 
 
 def latency(
@@ -73,6 +116,7 @@ def latency(
     ] = None,
     eds: EdsOption = None,
     accept_no_watchdog: NoWatchdogOption = False,
+    as_json: JsonOption = False,
 ) -> int:
     """Measure the timing of the cycle on the bus of CONFIG, and the shortest cycle it can hold.
 
@@ -86,7 +130,7 @@ def latency(
         drive__accept_no_watchdog=accept_no_watchdog or None,
     )
     from canwall.bench import measure_latency
-    from canwall.bench.latency_report import report_lines, write_latency
+    from canwall.bench.latency_report import json_content, report_lines, write_latency
 
     processes = os.cpu_count() or 1 if load is None else load
     with ProgressDisplay() as display, stop_on_signals() as stop:
@@ -96,11 +140,19 @@ def latency(
     if measured is None:
         raise StoppedError("interrupted; the drive is as it was before")
     failed = failed_if(measured.not_restored)
-    for line in report_lines(measured):
-        console.print(line, soft_wrap=True, highlight=False, markup=False)
+    if as_json:
+        print_json(json_content(measured))
+    else:
+        for line in report_lines(measured):
+            console.print(line, soft_wrap=True, highlight=False, markup=False)
     if output is not None:
         for path in write_latency(measured, output):
-            console.print(str(path), soft_wrap=True, highlight=False)
+            if not as_json:
+                console.print(str(path), soft_wrap=True, highlight=False)
+        if not is_installed("plot"):
+            say(f"no picture: {how_to_install('plot')}")
+    if as_json:
+        return failed
     console.print(measured.shortest_cycle.text, soft_wrap=True, highlight=False, markup=False)
     return failed
 
@@ -111,20 +163,35 @@ def _print_findings(findings: "Findings") -> None:
         for line in findings.lines:
             trouble = "" if line.well else "TROUBLE: "
             console.print(
-                f"{line.section}: {line.what}: {trouble}{line.found}",
+                f"{line.section}: {line.what}: {trouble}{line.found}{_to_do(line)}",
                 markup=False,
                 highlight=False,
                 soft_wrap=True,
             )
         return
     table = Table(title="Doctor", title_justify="left")
-    for column in ("", "from", "found"):
+    for column in ("", "checked", "found", "to do"):
         table.add_column(column)
     section = ""
     for line in findings.lines:
         style = "" if line.well else "bold red"
         heading = "" if line.section == section else line.section
-        table.add_row(*(escape(text) for text in (heading, line.what, line.found)), style=style)
+        cells = (heading, line.what, line.found, line.do)
+        table.add_row(*(escape(text) for text in cells), style=style)
         section = line.section
-    if findings.lines:
-        console.print(table)
+    console.print(table)
+
+
+def _print_verdict(findings: "Findings", config_file: Path) -> None:
+    if findings.well:
+        lines = [f"ready: canwall run {config_file}"]
+    else:
+        lines = ["not ready; to mend:"]
+        for number, line in enumerate(findings.troubles, start=1):
+            lines.append(f"{number:2}. {line.section}, {line.what}: {line.found}{_to_do(line)}")
+    for text in lines:
+        console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def _to_do(line: "Finding") -> str:
+    return f" → {line.do}" if line.do else ""

@@ -1,12 +1,12 @@
 """End of every command: exit codes, and errors as one line."""
 
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import typer
 
 from canwall.cli.output import say
-from canwall.errors import InputError, RunFailedError, one_line
+from canwall.errors import InputError, RunFailedError, did_you_mean, one_line
 
 #: Exit codes: a run that failed or tripped, bad input, Ctrl-C with the drive disabled.
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
@@ -39,12 +39,13 @@ def failed_if(troubles: Iterable[str]) -> int:
 def _tell(error: BaseException) -> int:
     """Print an error as a line; return its exit code. Raises it again if it is a bug."""
     if isinstance(error, (KeyboardInterrupt, typer.Abort)):
+        say("interrupted")
         return INTERRUPTED
     if isinstance(error, StoppedError):
         say(str(error))
         return INTERRUPTED
     if isinstance(error, typer.TyperException):
-        if text := error.format_message():  # empty if the help was shown instead
+        if text := _usage_text(error):  # empty if the help was shown instead
             say(one_line(text))
         return BAD_INPUT
     if isinstance(error, InputError):
@@ -54,6 +55,16 @@ def _tell(error: BaseException) -> int:
         say(str(error))
         return FAILED
     raise error
+
+
+def _usage_text(error: typer.TyperException) -> str:
+    """Return what is wrong with the words of a command line."""
+    # An option that does not exist; typer's list of possible ones is replaced.
+    given: str | None = getattr(error, "option_name", None)
+    possible: Sequence[str] | None = getattr(error, "possibilities", None)
+    if given and possible:
+        return error.message + did_you_mean(given, possible)
+    return error.format_message()
 
 
 def _is_bus_error(error: BaseException) -> bool:

@@ -10,11 +10,13 @@ from canwall.cli.ending import FAILED, INTERRUPTED, failed_if
 from canwall.cli.options import (
     ConfigArgument,
     EdsOption,
+    JsonOption,
     NoWatchdogOption,
     absolute_path,
     settings_from,
 )
-from canwall.cli.output import ProgressDisplay, console, say
+from canwall.cli.output import ProgressDisplay, console, print_json, say
+from canwall.extras import how_to_install, is_installed
 from canwall.stopping import stop_on_signals
 
 
@@ -30,6 +32,7 @@ def identify(
     output: Annotated[Path | None, typer.Option(help="Folder of the record and report.")] = None,
     eds: EdsOption = None,
     accept_no_watchdog: NoWatchdogOption = False,
+    as_json: JsonOption = False,
 ) -> int:
     """Measure inertia, friction, cogging, delay, current loop and shaft of the free handle.
 
@@ -44,7 +47,7 @@ def identify(
     with stop_on_signals(held=False) as stop:
         with ProgressDisplay() as display:
             from canwall.identify import identify as measure
-            from canwall.identify import report_lines, toml_fragment, write_report
+            from canwall.identify import json_content, report_lines, toml_fragment, write_report
 
             gc.freeze()  # modules stay; the collector need not visit them
             found = measure(settings, output, hand, display.report, display.advance)
@@ -53,16 +56,24 @@ def identify(
             say(trip)
         told = found.servo is not None or found.hand is not None
         if told:
-            for line in report_lines(found, settings, inertia):
-                console.print(line, soft_wrap=True, highlight=False, markup=False)
-            if fragment := toml_fragment(found):
-                console.print(f"\n{fragment}", soft_wrap=True, highlight=False, markup=False)
             write_report(found, settings, inertia)
-        console.print(f"record: {result.folder.path}", soft_wrap=True, highlight=False)
+        if as_json:
+            found_content = json_content(found) if told else {}
+            print_json({"record": result.folder.path} | found_content)
+        else:
+            if told:
+                for line in report_lines(found, settings, inertia):
+                    console.print(line, soft_wrap=True, highlight=False, markup=False)
+                if fragment := toml_fragment(found):
+                    console.print(f"\n{fragment}", soft_wrap=True, highlight=False, markup=False)
+            console.print(f"record: {result.folder.path}", soft_wrap=True, highlight=False)
+        if told and not is_installed("plot"):
+            say(f"no picture: {how_to_install('plot')}")
         for remark in result.remarks:
             say(remark)
         if failed_if((*result.not_restored, *result.notes)):
             return FAILED
         if result.outcome.interrupted or stop():
+            say("interrupted; the drive is disabled")
             return INTERRUPTED
         return 0 if told else FAILED

@@ -5,11 +5,33 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from canwall.cli.completion import complete_config, complete_law
+
 if TYPE_CHECKING:
     from canwall.config import Settings
 
 ConfigArgument = Annotated[
-    Path | None, typer.Argument(metavar="CONFIG", help="A TOML file; without: config/sim.toml.")
+    Path | None,
+    typer.Argument(
+        metavar="CONFIG",
+        help="A TOML file; without: config/sim.toml.",
+        autocompletion=complete_config,
+    ),
+]
+ConfigFile = Annotated[
+    Path,
+    typer.Argument(
+        metavar="CONFIG",
+        help="A TOML file, or a name of `canwall config`.",
+        autocompletion=complete_config,
+    ),
+]
+LawsOption = Annotated[
+    list[str] | None,
+    typer.Option("--law", help="A law; may be repeated.", autocompletion=complete_law),
+]
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Print the result as JSON on standard output.")
 ]
 EdsOption = Annotated[
     Path | None, typer.Option("--eds", metavar="PATH", help="The drive's EDS or DCF.")

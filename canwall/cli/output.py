@@ -6,6 +6,8 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from canwall.strict_json import as_json
+
 
 class _LastingConsole(Console):
     """Console that outlasts its file: a full disk or a closed pipe does not end a command."""
@@ -33,6 +35,11 @@ errors = _LastingConsole(stderr=True, soft_wrap=True, highlight=False)
 def say(text: str) -> None:
     """Print an error, a warning or a note as a line on standard error."""
     errors.print(f"canwall: {text}", markup=False)
+
+
+def print_json(content: Any) -> None:
+    """Print a result as a line of JSON on standard output; what is no finite number is null."""
+    console.print(as_json(content), soft_wrap=True, highlight=False, markup=False, emoji=False)
 
 
 class ProgressDisplay:

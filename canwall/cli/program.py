@@ -3,31 +3,74 @@
 import gc
 import os
 import sys
-from typing import Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
+from typer.core import TyperGroup
 
-from canwall.cli.ending import guarded
+from canwall.cli.ending import StoppedError, guarded
 from canwall.cli.output import say
 from canwall.code_on_disk import is_first_start
-from canwall.compiled import announce_compiling
 from canwall.supervised import given_up
+
+
+class _Commands(TyperGroup):
+    """Commands in which Ctrl-C has words; typer would only make an exit code of it."""
+
+    def invoke(self, context: Any) -> Any:
+        """Call the command."""
+        try:
+            return super().invoke(context)
+        except KeyboardInterrupt as error:
+            stopped = StoppedError("interrupted")
+            for note in getattr(error, "__notes__", ()):
+                stopped.add_note(note)
+            raise stopped from error
 
 
 def make_program(**settings: Any) -> typer.Typer:
     """Make a program without commands; settings are those of `typer.Typer`."""
     return typer.Typer(
-        add_completion=False,
+        cls=_Commands,
+        context_settings={"help_option_names": ["-h", "--help"]},
         pretty_exceptions_enable=False,
         rich_markup_mode="markdown",  # in rich markup the units [m] would be tags
         **settings,
     )
 
 
+def add_version(program: typer.Typer) -> None:
+    """Give a program the option --version."""
+
+    @program.callback()
+    def _options(
+        version: Annotated[
+            bool,
+            typer.Option(
+                "--version",
+                callback=_tell_version,
+                is_eager=True,
+                help="Show the version and exit.",
+            ),
+        ] = False,
+    ) -> None:
+        pass
+
+
+def _tell_version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        typer.echo(f"canwall {version('canwall')}")
+        raise typer.Exit
+
+
 def run_program(program: typer.Typer) -> NoReturn:
     """Run the program with the arguments of the process and exit with its exit code."""
     _occupy_standard_streams()
     if is_first_start():
+        from canwall.compiled import announce_compiling
+
         announce_compiling(
             lambda: say(
                 "compiling for this machine, about half a minute; later starts have it on disk"

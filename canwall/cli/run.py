@@ -1,24 +1,33 @@
 """Commands that render walls: `run`, `change` during a run, and the simulated `drive`."""
 
+import contextlib
 import gc
+import json
+import subprocess
+import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import IO, TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich import box
+from rich.markup import escape
 from rich.table import Table
 
+from canwall.cli.completion import complete_config, complete_law
 from canwall.cli.ending import FAILED, INTERRUPTED, failed_if
 from canwall.cli.options import (
     ConfigArgument,
     EdsOption,
+    JsonOption,
     NoWatchdogOption,
     absolute_path,
     settings_from,
 )
-from canwall.cli.output import ProgressDisplay, console, say
+from canwall.cli.output import ProgressDisplay, console, print_json, say
 from canwall.errors import ConfigError
+from canwall.extras import need
 from canwall.stopping import stop_on_signals
 
 if TYPE_CHECKING:
@@ -32,9 +41,12 @@ def run(
         typer.Argument(
             metavar="CONFIG",
             help="TOML files, one for each drive on the bus; without: config/sim.toml.",
+            autocompletion=complete_config,
         ),
     ] = None,
-    law: Annotated[str | None, typer.Option(help="Law of the wall.")] = None,
+    law: Annotated[
+        str | None, typer.Option(help="Law of the wall.", autocompletion=complete_law)
+    ] = None,
     stiffness: Annotated[float | None, typer.Option(help="Stiffness [N·m/rad].")] = None,
     damping: Annotated[float | None, typer.Option(help="Damping [N·m·s/rad].")] = None,
     duration: Annotated[float | None, typer.Option(help="Seconds; without: until Ctrl-C.")] = None,
@@ -44,6 +56,20 @@ def run(
     restore: Annotated[
         bool, typer.Option("--restore", help="Put back what the set-up changed in the drive.")
     ] = False,
+    stream: Annotated[
+        str | None,
+        typer.Option(
+            metavar="udp://HOST:PORT",
+            help="Send every cycle there as JSON, for PlotJuggler; without HOST: this machine.",
+        ),
+    ] = None,
+    panel: Annotated[
+        bool, typer.Option("--panel", help="Show the run in the browser (`canwall panel`).")
+    ] = False,
+    panel_port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port of --panel; 0: a free one.")
+    ] = 0,
+    as_json: JsonOption = False,
 ) -> int:
     """Render the wall: enable the drive, run, record, disable it again.
 
@@ -52,6 +78,8 @@ def run(
     """
     from canwall import config
 
+    if panel:
+        need("panel")
     files = config_files or [config.shipped("config/sim.toml")]
     overrides = {
         "wall__law": law and config.absolute_law(law, Path()),
@@ -70,19 +98,49 @@ def run(
             from canwall.run import run_together  # while the writers of the record start
 
             gc.freeze()  # modules stay; the collector need not visit them
-            results = run_together(many, recorders, output, display.report, display.advance)
-        code = _tell(results)
-        return INTERRUPTED if code == 0 and stop() else code
+            results = run_together(
+                many,
+                recorders,
+                output,
+                display.report,
+                display.advance,
+                stream=stream,
+                live=partial(_open_panel, panel_port) if panel else lambda folder: None,
+            )
+        code = _tell(results, as_json)
+        if code == 0 and (stop() or results[0].outcome.interrupted):
+            # Here, where signals are still held.
+            say("interrupted; the drive is disabled")
+            return INTERRUPTED
+        return code
 
 
-def _tell(results: "Sequence[RunResult]") -> int:
-    """Print what came of the walls; return the exit code."""
+def _open_panel(port: int, folder: Path) -> None:
+    """Open the panel of a run in a process of its own, which Ctrl-C for this one does not reach.
+
+    Its address goes to standard error, since the result of a run may be read from standard output.
+    """
+    words = [sys.executable, "-m", "canwall", "panel", str(folder), "--port", str(port)]
+    words.append("--with-run")
+    try:
+        subprocess.Popen(
+            words, stdin=subprocess.DEVNULL, stdout=sys.stderr.fileno(), start_new_session=True
+        )
+    except OSError as error:
+        say(f"the panel does not start: {error}; canwall panel {folder} opens it")
+
+
+def _tell(results: "Sequence[RunResult]", as_json: bool) -> int:
+    """Print what came of the walls; return the exit code but for Ctrl-C."""
     code = 0
     for result in results:
-        console.print(_strike_table(result.summary["strikes"]))
-        console.print(f"record: {result.folder.path}", soft_wrap=True, highlight=False)
-        for advice in result.summary["timing"]["advice"] if result is results[0] else ():
-            console.print(advice, soft_wrap=True, highlight=False, markup=False)
+        if as_json:
+            print_json({"record": result.folder.path} | result.summary)
+        else:
+            console.print(_strike_table(result.summary["strikes"]))
+            console.print(f"record: {result.folder.path}", soft_wrap=True, highlight=False)
+            for advice in result.summary["timing"]["advice"] if result is results[0] else ():
+                console.print(advice, soft_wrap=True, highlight=False, markup=False)
         for remark in result.remarks:
             say(remark)
         code |= failed_if((*result.not_restored, *result.notes))
@@ -93,18 +151,15 @@ def _tell(results: "Sequence[RunResult]") -> int:
         raise outcome.error
     if outcome.trips:
         return FAILED
-    return code or (INTERRUPTED if outcome.interrupted else 0)
+    return code
 
 
 def _run_settings(path: Path, overrides: dict[str, Any]) -> "Settings":
     settings = settings_from(path, **overrides)
-    if overrides["wall__damping_nm_s_per_rad"] is not None:
-        wall = settings.wall.model_copy(update={"damping_ratio": None})
-        settings = settings.model_copy(update={"wall": wall})
-    if overrides["wall__law"] is not None:
-        kept = tuple(change.model_copy(update={"law": None}) for change in settings.schedule)
-        settings = settings.model_copy(update={"schedule": kept})
-    return settings
+    return settings.without_replacements(
+        law=overrides["wall__law"] is not None,
+        damping=overrides["wall__damping_nm_s_per_rad"] is not None,
+    )
 
 
 def change(
@@ -113,13 +168,17 @@ def change(
         list[str],
         typer.Argument(metavar="KEY=VALUE", help="stiffness_nm_per_rad=80, limits.torque_nm=1"),
     ],
+    as_json: JsonOption = False,
 ) -> int:
     """Change the wall of a run in progress; the keys are those of [[schedule]]."""
     from canwall.record import RunFolder
     from canwall.run.changes import post_change
 
     cycle = post_change(RunFolder(folder), assignments)
-    console.print(f"in force from cycle {cycle} on", highlight=False)
+    if as_json:
+        print_json({"cycle": cycle})
+    else:
+        console.print(f"in force from cycle {cycle} on", highlight=False)
     return 0
 
 
@@ -129,8 +188,18 @@ def drive(
         bool, typer.Option("--real-time", help="Measured time instead of a period per SYNC.")
     ] = False,
     eds: EdsOption = None,
+    ready_fd: Annotated[
+        int | None,
+        typer.Option(
+            "--ready-fd", metavar="N", help="Write a line to this descriptor when ready; close it."
+        ),
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print what happens as JSON, a line for each event.")
+    ] = False,
 ) -> int:
     """Simulate a drive, alone on the bus of CONFIG, until stopped."""
+    gc.disable()  # nothing of what is imported now is garbage; it takes a fifth longer
     settings = settings_from(config_file, drive__eds=absolute_path(eds))
     if real_time and settings.simulation is not None:
         simulation = settings.simulation.model_copy(update={"real_time": True})
@@ -140,49 +209,91 @@ def drive(
             "bus.interface = 'virtual' ends at this process, so no master could reach the drive; "
             "use 'unixcan' or 'socketcan' (see config/unixcan.toml)"
         )
-    from canwall.run import serve_drive
+    ready = None if ready_fd is None else _opened(ready_fd)
+    from canwall.library.simulated_drive import SimulatedDrive
 
-    def announce() -> None:
-        console.print(
-            f"simulated drive, node {settings.drive.node_id}, "
-            f"on {settings.bus.interface} {settings.bus.channel}; Ctrl-C ends it",
-            soft_wrap=True,
-            highlight=False,
+    def tell(line: str, event: str, **more: Any) -> None:
+        if as_json:
+            line = json.dumps({"event": event} | more, ensure_ascii=False)
+        console.print(line, soft_wrap=True, highlight=False, markup=False, emoji=False)
+
+    def report(line: str) -> None:
+        tell(line, "report", text=line)
+
+    with (
+        stop_on_signals() as stop,
+        SimulatedDrive.from_settings(settings, report) as simulated,
+    ):
+        tell(
+            f"simulated drive, node {simulated.node_id}, "
+            f"on {simulated.interface} {simulated.channel}; Ctrl-C ends it",
+            "ready",
+            node_id=simulated.node_id,
+            interface=simulated.interface,
+            channel=simulated.channel,
+            eds=str(simulated.eds),
         )
-
-    def report(event: str) -> None:
-        console.print(event, soft_wrap=True, highlight=False, markup=False)
-
-    with stop_on_signals() as stop:
-        serve_drive(settings, stop, announce, report)
+        gc.freeze()
+        gc.enable()
+        if ready is not None:
+            _notify(ready)
+        simulated.wait_until(stop, timeout_s=None)
     return 0
 
 
+def _opened(descriptor: int) -> IO[bytes]:
+    """Return a descriptor that the process was started with, to be written to."""
+    try:
+        return open(descriptor, "wb", buffering=0)
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or str(error)
+        raise ConfigError(
+            f"--ready-fd {descriptor}: {why}; start the command with this descriptor open for "
+            f"writing"
+        ) from None
+
+
+def _notify(ready: IO[bytes]) -> None:
+    """Write the line that says that the drive is ready, if anybody still waits for it."""
+    with contextlib.suppress(OSError), ready:
+        ready.write(b"ready\n")
+
+
 def _strike_table(strikes: list[dict[str, Any]]) -> Table:
-    # At most eleven columns in a terminal of 80 characters.
+    # At most eleven columns in a terminal of 80 characters; a long name of a law is folded.
+    from canwall.config import short_law
+
     finds = any(_is_found(strike) for strike in strikes)
     table = Table(
         title="Strikes", title_justify="left", box=box.SIMPLE, padding=0, show_edge=not finds
     )
-    table.add_column("#", justify="right")
-    table.add_column("law", no_wrap=True)
-    table.add_column("K asked" if finds else "K\n\\[N·m/rad]", justify="right")
-    if finds:
-        table.add_column("in\nforce", justify="right")
-        table.add_column("mass\n\\[g·m²]", justify="right")
-    table.add_column("con-\ntacts" if finds else "contacts", justify="right")
-    table.add_column("depth\n\\[mrad]" if finds else "deepest\n\\[mrad]", justify="right")
-    table.add_column("first\n÷ ref.", justify="right")
-    table.add_column("energy\n\\[mJ]" if finds else "energy\nout \\[mJ]", justify="right")
-    table.add_column("ripple\n\\[N]", justify="right")
-    table.add_column("chatter", no_wrap=True)
-    for number, strike in enumerate(strikes, start=1):
+    headings = [
+        "#",
+        "law",
+        "K\nasked" if finds else "K\n\\[N·m/rad]",
+        *(["in\nforce", "mass\n\\[g·m²]"] if finds else []),
+        "con-\ntacts" if finds else "contacts",
+        "depth\n\\[mrad]" if finds else "deepest\n\\[mrad]",
+        "first\n÷ ref.",
+        "energy\n\\[mJ]" if finds else "energy\nout \\[mJ]",
+        "ripple\n\\[N]",
+        "chatter",
+    ]
+    for heading in headings:
+        is_law, is_text = heading == "law", heading in ("law", "chatter")
+        table.add_column(
+            heading,
+            justify="left" if is_text else "right",
+            no_wrap=not is_law,
+            overflow="fold" if is_law else "ellipsis",
+        )
+    for count, strike in enumerate(strikes, start=1):
         chatter = "no"
         if strike["chatter"]:
             chatter = f"yes, {strike['chatter_frequency_hz']:.0f} Hz"
         table.add_row(
-            str(number),
-            strike["law"],
+            str(count),
+            escape(short_law(strike["law"])),
             f"{strike['stiffness']:g}",
             *(_found(strike) if finds else ()),
             str(strike["contacts"]),

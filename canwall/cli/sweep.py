@@ -3,14 +3,18 @@
 import os
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from canwall.cli.ending import StoppedError
-from canwall.cli.options import ConfigArgument, settings_from
-from canwall.cli.output import ProgressDisplay, console, say
+from canwall.cli.options import ConfigArgument, JsonOption, LawsOption, settings_from
+from canwall.cli.output import ProgressDisplay, console, print_json, say
 from canwall.errors import InputError, RunFailedError
+from canwall.extras import need
+
+if TYPE_CHECKING:
+    from xarray import Dataset
 
 
 def sweep(
@@ -18,7 +22,7 @@ def sweep(
     output: Annotated[
         Path | None, typer.Option(metavar="FILE.nc", help="NetCDF file of the result.")
     ] = None,
-    law: Annotated[list[str] | None, typer.Option(help="A law; may be repeated.")] = None,
+    law: LawsOption = None,
     stiffness: Annotated[
         str | None,
         typer.Option(
@@ -56,10 +60,12 @@ def sweep(
             "of CONFIG is ignored. With --output, the result is written as well.",
         ),
     ] = None,
+    as_json: JsonOption = False,
 ) -> int:
     """Sweep strikes over any axes and judge each wall, or search the K-limit at each point."""
     if workers is not None and dask is not None:
         raise InputError("--workers and --dask: keep one; a cluster has workers of its own")
+    need("sweep")
     from canwall.config import absolute_law
 
     laws = [absolute_law(name, Path()) for name in law or []]
@@ -73,7 +79,15 @@ def sweep(
         }
         if given := ", ".join(option for option, value in unused.items() if value):
             raise InputError(f"--table has fixed axes: leave out {given}")
-        return _print_law_table(config_file, table, output, laws, operator, through, workers, dask)
+        compute = partial(_compute_law_table, config_file, table, output, laws, operator)
+        dataset = compute(through, workers, dask)
+        from canwall.sweep import format_law_table
+
+        if as_json:
+            print_json(dataset.to_dict())
+        else:
+            print(format_law_table(dataset))
+        return 0
     if output is None:
         raise InputError("--output is missing: give the FILE.nc of the result")
     axes = _parse_axes(axis or [])
@@ -98,6 +112,9 @@ def sweep(
             raise StoppedError(f"interrupted; --resume continues {output}") from None
         except RunFailedError as error:
             raise RunFailedError(f"{error}; --resume continues {output}") from None
+    if as_json:
+        print_json(dataset.to_dict())
+        return 0
     console.print(sweep_table(dataset))
     for note in ineffective_axis_notes(dataset):
         console.print(note, soft_wrap=True, highlight=False)
@@ -119,7 +136,7 @@ def _parse_axes(assignments: list[str]) -> dict[str, object]:
     return axes
 
 
-def _print_law_table(
+def _compute_law_table(
     config_file: Path | None,
     table: str,
     output: Path | None,
@@ -128,9 +145,9 @@ def _print_law_table(
     through: str,
     workers: int | None,
     dask: str | None,
-) -> int:
+) -> "Dataset":
     settings = settings_from(config_file)
-    from canwall.sweep import OPERATORS, compute_law_table, format_law_table, write_sweep
+    from canwall.sweep import OPERATORS, compute_law_table, write_sweep
 
     if output is not None and os.path.lexists(output):
         raise InputError(f"{output}: exists already; choose another --output")
@@ -142,8 +159,7 @@ def _print_law_table(
         )
     if output is not None:
         write_sweep(dataset, output)
-    print(format_law_table(dataset))
-    return 0
+    return dataset
 
 
 def plot(
@@ -156,12 +172,14 @@ def plot(
     The folder of a run that did not end by itself is completed from its rows first.
     """
     if what.suffix == ".nc":
+        need("plot", "sweep")
         from canwall.sweep import read_sweep
         from canwall.sweep.figures import write_sweep_figures
 
         for picture in write_sweep_figures(read_sweep(what), what.with_suffix("")):
             console.print(str(picture), soft_wrap=True, highlight=False)
         return 0
+    need("plot")
     from canwall.record import RunFolder
     from canwall.record.pictures import DRAWN, draw_run
     from canwall.run import read_run

@@ -6,12 +6,20 @@ from typing import Annotated
 
 import typer
 
-from canwall.cli.output import ProgressDisplay, console
+from canwall.cli.completion import complete_law
+from canwall.cli.options import JsonOption
+from canwall.cli.output import ProgressDisplay, console, print_json
 from canwall.errors import InputError
+from canwall.extras import need
 
 
 def ball(
-    law: Annotated[str, typer.Option(help="Law of the floor, or 'continuous' for its referent.")],
+    law: Annotated[
+        str,
+        typer.Option(
+            help="Law of the floor, or 'continuous' for its referent.", autocompletion=complete_law
+        ),
+    ],
     output: Annotated[Path, typer.Option(help="CSV file: t, y, v, f.")],
     stiffness: Annotated[float, typer.Option(help="Floor's stiffness K [N/m].")] = 1.0,
     damping: Annotated[float, typer.Option(help="Floor's damping B [N·s/m].")] = 0.0,
@@ -27,6 +35,7 @@ def ball(
     tension: Annotated[str, typer.Option(help="allow, clamp or budget.")] = "allow",
     passivity: Annotated[float, typer.Option(help="Passivity controller's damping.")] = 0.0,
     option: Annotated[list[str] | None, typer.Option(help="Law's option, NAME=VALUE.")] = None,
+    as_json: JsonOption = False,
 ) -> int:
     """Simulate a ball that bounces on the wall as its floor: exact state, no delay, held force."""
     from canwall.config import absolute_law
@@ -56,9 +65,18 @@ def ball(
     write_ball(output, ball, y, v, force)
     energy = ball.energy(y, v)
     outside = (y >= 0.0).nonzero()[0]
+    last = int(outside[-1]) if len(outside) else None
+    if as_json:
+        found = {
+            "theta": ball.theta,
+            "energy_start_j": energy[0],
+            "energy_end_j": None if last is None else energy[last],
+            "end_s": None if last is None else last * period,
+        }
+        print_json(found)
+        return 0
     end = "never outside"
-    if len(outside):
-        last = int(outside[-1])
+    if last is not None:
         end = f"{energy[last]:.9g} at the last sample outside (t = {last * period:g})"
     console.print(
         f"θ = {ball.theta:g}; energy {energy[0]:.9g} at the start, {end}",
@@ -86,6 +104,7 @@ def figures(
     output: Annotated[Path, typer.Option(help="Folder for pictures, data and index.md.")],
 ) -> int:
     """Draw the figures of the chapter, each with its data, and a comparison of all laws."""
+    need("plot", "sweep")
     from canwall.workbench.figures import write_figures
 
     with ProgressDisplay() as display:

@@ -4,6 +4,7 @@ Every key has its unit in its name. An unknown key, a wrong type or an impossibl
 `ConfigError` of one line: file, key, what is wrong, what to do.
 """
 
+from canwall.config.catalogue import catalogue, located, named, portable_text, shipped, title_of
 from canwall.config.drive import Drive
 from canwall.config.fault import Fault
 from canwall.config.hand import Hand, Move, RandomStrikes
@@ -12,14 +13,28 @@ from canwall.config.reading import (
     check_values,
     first_error,
     load,
-    shipped,
+    parse,
+    short_law,
     with_overrides,
 )
+from canwall.config.requests import (
+    ChangeWall,
+    End,
+    Mark,
+    Request,
+    TakeTurns,
+    WatchBeat,
+    parse_request,
+)
+from canwall.config.section import Section, changed
 from canwall.config.settings import (
     Bus,
     Estimator,
+    Guard,
     Limits,
+    LimitsChange,
     Mechanics,
+    Operator,
     Run,
     Scheduled,
     Settings,
@@ -32,26 +47,45 @@ from canwall.errors import ConfigError
 
 __all__ = [
     "Bus",
+    "ChangeWall",
     "ConfigError",
     "Drive",
+    "End",
     "Estimator",
     "Fault",
+    "Guard",
     "Hand",
     "Limits",
+    "LimitsChange",
+    "Mark",
     "Mechanics",
     "Move",
+    "Operator",
     "RandomStrikes",
+    "Request",
     "Run",
     "Scheduled",
+    "Section",
     "Settings",
     "Simulation",
     "Stage",
+    "TakeTurns",
     "Wall",
     "WallChange",
+    "WatchBeat",
     "absolute_law",
+    "catalogue",
+    "changed",
     "check_values",
     "first_error",
     "load",
+    "located",
+    "named",
+    "parse",
+    "parse_request",
+    "portable_text",
     "shipped",
+    "short_law",
+    "title_of",
     "with_overrides",
 ]

@@ -1,7 +1,7 @@
 """Reading of a configuration: from a file to settings, or to one line about the first error."""
 
-import difflib
 import math
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,8 +9,9 @@ from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
+from canwall.config.catalogue import located
 from canwall.config.settings import Settings
-from canwall.errors import ConfigError
+from canwall.errors import ConfigError, did_you_mean
 
 # [wall] may be given in lengths and forces at a handle of radius r instead of angles and torques
 # at its shaft. Each entry: metric key, angular key, and the exponent of r between them.
@@ -53,18 +54,25 @@ def load(path: Path, overrides: Mapping[str, Any] | None = None) -> Settings:
     """Read and validate a TOML file.
 
     Args:
-        path: The file; paths in it are relative to it.
+        path: The file, or the name of a configuration of the catalogue; paths in it are relative
+            to it.
         overrides: Values by dotted key, "wall.law", that replace those of the file.
 
     Raises:
         ConfigError: If the file cannot be read or is not valid.
     """
+    path = located(path)
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; give the path of a configuration") from None
     except (OSError, ValueError) as error:  # ValueError: for a NUL, and for what is no UTF-8
         raise ConfigError(f"{path}: cannot be read: {error}") from None
+    return parse(text, path, overrides)
+
+
+def parse(text: str, path: Path, overrides: Mapping[str, Any] | None = None) -> Settings:
+    """Validate TOML as that of the file `path`, which need not exist; otherwise as `load`."""
     try:
         raw = tomllib.loads(text)
     except ValueError as error:
@@ -161,6 +169,12 @@ def absolute_law(law: str, base: Path) -> str:
     return f"{(base / path).resolve()}:{function}" if colon else law
 
 
+def short_law(law: str) -> str:
+    """Return the name of a law without the folder of its file, for tables and pictures."""
+    path, colon, function = law.rpartition(":")
+    return f"{Path(path).name}:{function}" if colon else law
+
+
 # Names of types in TOML, by the pydantic errors that use Python's names.
 _TOML_TYPES = {
     "model_type": "a table",
@@ -186,7 +200,10 @@ def first_error(error: ValidationError, model: type[BaseModel] = Settings) -> st
         return message
     if first["type"] == "value_error":
         return f"{key}: {message}"
-    return f"{key}: has to be {_TOML_TYPES.get(first['type'], message)}, not {_format(given)}"
+    hint = ""
+    if first["type"] == "literal_error" and isinstance(given, str):
+        hint = did_you_mean(given, re.findall(r"'([^']*)'", first["ctx"]["expected"]))
+    return f"{key}: has to be {_TOML_TYPES.get(first['type'], message)}, not {_format(given)}{hint}"
 
 
 def _format(value: object) -> str:
@@ -205,12 +222,4 @@ def _suggestion(where: list[str], model: Any) -> str:
     known = list(model.model_fields)
     if where[-1] in _METRIC_KEYS:
         return "; lengths and forces at the handle need mechanics.handle_radius_m"
-    close = difflib.get_close_matches(where[-1], known, n=1, cutoff=0.5)
-    return f"; did you mean {close[0]}?" if close else f"; known here: {', '.join(known)}"
-
-
-def shipped(relative: str) -> Path:
-    """Return the path of a file that ships with the project, e.g. `config/sim.toml`."""
-    package = Path(__file__).resolve().parents[1]
-    installed = package / "data" / relative
-    return installed if installed.exists() else package.parent / relative
+    return did_you_mean(where[-1], known) or f"; known here: {', '.join(known)}"

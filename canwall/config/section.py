@@ -34,6 +34,12 @@ class Change(Section):
 
 
 _C = TypeVar("_C", bound=Change)
+_S = TypeVar("_S", bound=Section)
+
+
+def changed(section: _S, change: Change | None) -> _S:
+    """Return the section with the new values of a change of it, if there is one."""
+    return section.model_copy(update=change.model_dump(exclude_none=True) if change else {})
 
 
 def changing(section: type[Section], keys: Iterable[str]) -> Callable[[type[_C]], type[_C]]:

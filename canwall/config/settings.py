@@ -13,6 +13,7 @@ from canwall.config.section import (
     Number,
     Positive,
     Section,
+    changed,
     changing,
 )
 from canwall.config.simulation import Simulation
@@ -40,13 +41,33 @@ class Bus(Section):
 
 
 class Mechanics(Section):
-    """`[mechanics]`: the model of everything that moves, as the laws use it."""
+    """`[mechanics]`: the model of everything that moves, as the laws use it.
+
+    Attributes:
+        shaft_hz: Resonance of the rotor against the rest of inertia_kg_m2; 0: a rigid shaft.
+        shaft_damping_ratio: Damping ratio of that resonance.
+        rotor_inertia_kg_m2: With shaft_hz, the rotor's part of inertia_kg_m2.
+    """
 
     inertia_kg_m2: Positive
     viscous_nm_s_per_rad: NonNegative = 0.0
     coulomb_nm: NonNegative = 0.0
     spring_nm_per_rad: NonNegative = 0.0
     handle_radius_m: Positive | None = None
+    shaft_hz: Annotated[NonNegative, Field(le=1e5)] = 0.0
+    shaft_damping_ratio: Annotated[NonNegative, Field(lt=1.0)] = 0.02
+    rotor_inertia_kg_m2: Positive | None = None
+
+    @model_validator(mode="after")
+    def _has_a_rotor(self) -> Self:
+        rotor = self.rotor_inertia_kg_m2
+        if self.shaft_hz and (rotor is None or rotor >= self.inertia_kg_m2):
+            given = "it is missing" if rotor is None else f"not {rotor:g}"
+            raise ValueError(
+                "rotor_inertia_kg_m2: with shaft_hz it has to be less than inertia_kg_m2, of which "
+                f"it is a part; {given}"
+            )
+        return self
 
 
 class Wall(Section):
@@ -54,7 +75,8 @@ class Wall(Section):
 
     Attributes:
         damping_ratio: ζ of B = 2·ζ·√(K·m) with the mass in force, in place of a given damping.
-        cap: c of the largest stiffness in force, c·m/T² with the mass in force.
+        cap: c of the largest stiffness in force, c·m/T² with the mass in force, and on an elastic
+            shaft no more than what leaves its resonance stable.
     """
 
     law: str = "half_sample"
@@ -78,18 +100,23 @@ class Estimator(Section):
 
     Attributes:
         force_walk_nm_per_sqrt_s: Random walk of the operator's force. Default: 0.2; with
-            operator.adapt so much for the lightest hand that the filter is as quick as the delay
-            is short, and less for heavier ones.
+            operator.adapt so much for the lightest hand that its filter is nearly as quick as the
+            delay is short, and for heavier ones that theirs are as quick or slower.
         delay_cycles: Delay D from the sampling of a position until the torque computed from it
             takes effect, in cycles. Default: 1 with synchronous PDOs; measured with others.
-        measure_delay: Always measure the delay before the wall is rendered.
+        delay_margin_cycles: What the model of the laws has more than that: too little delay costs
+            far more stiffness than too much. Default: 0.1 with operator.adapt, else 0.
+        measure_delay: Measure the delay before the wall is rendered. False: where nothing tells
+            it, neither delay_cycles nor synchronous PDOs. "auto": also where the lag of the
+            drive's current loop is not known and a law has a model. True: always.
         measure_torque_nm: Amplitude of the small torques of the measurement.
         measure_cycles: Duration of each of its two parts.
     """
 
     force_walk_nm_per_sqrt_s: Annotated[Positive, Field(ge=1e-4, le=100.0)] | None = None
     delay_cycles: Annotated[Number, Field(ge=0, le=3)] | None = None
-    measure_delay: bool = False
+    delay_margin_cycles: Annotated[Number, Field(ge=0, le=1)] | None = None
+    measure_delay: bool | Literal["auto"] = "auto"
     measure_torque_nm: Positive = 0.15
     measure_cycles: int = Field(400, ge=100, le=10_000)
 
@@ -177,26 +204,37 @@ class LimitsChange(Change):
     """Changes of `[limits]` while the wall is rendered."""
 
 
+@changing(Guard, ("action",))
+class GuardChange(Change):
+    """Changes of `[guard]` while the wall is rendered."""
+
+
+@changing(Operator, ("adapt",))
+class OperatorChange(Change):
+    """Changes of `[operator]` while the wall is rendered."""
+
+
 @changing(Wall, (key for key in Wall.model_fields if key not in ("side", "alternate")))
 class _WallKeys(Change):
     """Changes of `[wall]`: all keys except the side and the alternating laws."""
 
 
 class WallChange(_WallKeys):
-    """Changes of `[wall]` and, under `limits`, of `[limits]` while the wall is rendered."""
+    """Changes of `[wall]` and, under their names, of other sections while the wall is rendered."""
 
     limits: LimitsChange | None = None
+    guard: GuardChange | None = None
+    operator: OperatorChange | None = None
 
     def applied_to(self, wall: Wall, limits: Limits) -> tuple[Wall, Limits]:
         """Return wall and limits after the change."""
-        update = self.model_dump(exclude={"at_s", "limits"}, exclude_none=True)
+        keys = set(_WallKeys.model_fields)
+        update = self.model_dump(include=keys, exclude_none=True)
         if self.law is not None:
             update.setdefault("options", {})  # options belong to the previous law
         if self.damping_nm_s_per_rad is not None:
             update.setdefault("damping_ratio", None)  # a damping that is given takes its place
-        if self.limits is not None:
-            limits = limits.model_copy(update=self.limits.model_dump(exclude_none=True))
-        return wall.model_copy(update=update), limits
+        return wall.model_copy(update=update), changed(limits, self.limits)
 
 
 class Scheduled(WallChange):
@@ -206,11 +244,13 @@ class Scheduled(WallChange):
 
 
 class Stage(NamedTuple):
-    """Wall and limits in force from at_s on."""
+    """Wall, limits, guard and operator in force from at_s on."""
 
     at_s: float
     wall: Wall
     limits: Limits
+    guard: Guard
+    operator: Operator
 
 
 class Settings(Section):
@@ -231,14 +271,35 @@ class Settings(Section):
 
     @model_validator(mode="before")
     @classmethod
+    def _scale_alike(cls, values: Any) -> Any:
+        """Give the simulated drive the scales that its master was given, unless it has its own."""
+        if not isinstance(values, dict):
+            return values
+        drive, simulation = values.get("drive"), values.get("simulation")
+        if not (isinstance(drive, dict) and isinstance(simulation, dict)):
+            return values
+        given: dict[str, Any] = {}
+        counts, rated_nm = drive.get("counts_per_rev"), drive.get("rated_torque_nm")
+        if isinstance(counts, int | float) and float(counts).is_integer():
+            given["counts_per_rev"] = int(counts)
+        if rated_nm is not None:
+            given["rated_torque_nm"] = rated_nm
+        return values | {"simulation": given | simulation}
+
+    @model_validator(mode="before")
+    @classmethod
     def _idealise(cls, values: Any) -> Any:
         """Let the model know of an ideal servo (`[simulation] ideal`)."""
         if not isinstance(values, dict):
             return values
         drive, simulation = values.get("drive"), values.get("simulation")
         ideal = isinstance(simulation, dict) and simulation.get("ideal") is True
-        if ideal and isinstance(drive, dict):
-            return values | {"drive": drive | _IDEAL_DRIVE}
+        if not (ideal and isinstance(drive, dict)):
+            return values
+        values = values | {"drive": drive | _IDEAL_DRIVE}
+        estimator = values.get("estimator", {})
+        if isinstance(estimator, dict) and estimator.get("measure_delay", "auto") == "auto":
+            values["estimator"] = estimator | {"measure_delay": False}
         return values
 
     @field_validator("schedule", mode="before")
@@ -263,6 +324,17 @@ class Settings(Section):
             raise ValueError("schedule: the entries have to be in the order of at_s")
         if self.wall.alternate and any(change.law for change in self.schedule):
             raise ValueError("schedule: changes the law, and so does wall.alternate; keep one")
+        if not self.operator.adapt and any(stage.operator.adapt for stage in self.stages):
+            raise ValueError(
+                "schedule: operator.adapt: [mechanics] is with the hand where a run begins without "
+                "adapting; begin with operator.adapt = true"
+            )
+        bounded_by_shaft = self.mechanics.shaft_hz and self.wall.cap
+        if bounded_by_shaft and any(stage.wall.divider > 1 for stage in self.stages):
+            raise ValueError(
+                "wall.divider: has to be 1 with mechanics.shaft_hz and wall.cap, whose bound is "
+                "that of a law in every cycle; leave out wall.cap"
+            )
         low, high = self.limits.position_rad
         sections = ("wall", *(f"schedule.{i}" for i in range(len(self.schedule))))
         for section, stage in zip(sections, self.stages, strict=True):
@@ -275,10 +347,18 @@ class Settings(Section):
 
     @property
     def stages(self) -> list[Stage]:
-        """Walls and limits with the times from which they are in force; the first time is 0."""
-        timeline = [Stage(0.0, self.wall, self.limits)]
+        """Walls, limits and so on with the times from which they are in force, the first one 0."""
+        timeline = [Stage(0.0, self.wall, self.limits, self.guard, self.operator)]
         for change in self.schedule:
-            timeline.append(Stage(change.at_s, *change.applied_to(*timeline[-1][1:])))
+            _, wall, limits, guard, operator = timeline[-1]
+            timeline.append(
+                Stage(
+                    change.at_s,
+                    *change.applied_to(wall, limits),
+                    changed(guard, change.guard),
+                    changed(operator, change.operator),
+                )
+            )
         return timeline
 
     def laws_in_turn(self, wall: Wall) -> list[Wall]:
@@ -294,6 +374,19 @@ class Settings(Section):
         drive = self.drive.model_copy(update=_IDEAL_DRIVE)
         simulation = self.simulation and self.simulation.with_ideal_servo()
         return self.model_copy(update={"drive": drive, "simulation": simulation})
+
+    def without_replacements(self, *, law: bool, damping: bool) -> Self:
+        """Return the same without what would replace a given law, or a given damping.
+
+        Changes of law in `[[schedule]]` replace the law, the damping ratio the damping.
+        """
+        update: dict[str, Any] = {}
+        if damping:
+            update["wall"] = self.wall.model_copy(update={"damping_ratio": None})
+        if law:
+            changes = (change.model_copy(update={"law": None}) for change in self.schedule)
+            update["schedule"] = tuple(changes)
+        return self.model_copy(update=update)
 
     @property
     def masses(self) -> tuple[float, float]:

@@ -29,11 +29,12 @@ class Simulation(Section):
     """`[simulation]`: the mechanics of the simulated drive, and the hand on its handle.
 
     `objects` are power-on values that override those of the dictionary. Rated torque and encoder
-    come from the dictionary (0x6076, 0x608F); the keys are for a dictionary without them. The
-    motor's torque is limited to `peak_torque_nm` (by default three times the rated torque), and
-    falls back to the rated torque after `overload_s` at the peak, or longer below it (I²t). The
-    limit switches are closed outside `limit_switches_rad`, the home switch within
-    `home_switch_rad`. Parameters stored through 0x1010 are kept in the file `store`, if given.
+    come from the dictionary (0x6076, 0x608F); the keys are for a dictionary without them, and are
+    those of `[drive]` if only those are given. The motor's torque is limited to `peak_torque_nm`
+    (by default three times the rated torque), and falls back to the rated torque after `overload_s`
+    at the peak, or longer below it (I²t). The limit switches are closed outside
+    `limit_switches_rad`, the home switch within `home_switch_rad`. Parameters stored through 0x1010
+    are kept in the file `store`, if given.
 
     Friction is `coulomb_nm` in motion; at rest it holds up to `stiction_nm`, at least as much and
     by default 1.5 times that. The motor's cogging torque is a triangle wave of amplitude

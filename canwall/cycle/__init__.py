@@ -19,12 +19,14 @@ from canwall.cycle.state import (
     set_limits,
     set_wall,
     start_at,
+    stiffest_for,
 )
 from canwall.cycle.step import step
-from canwall.cycle.timing import HISTOGRAM, buckets_ns, observe_ns, percentile_ns, timing_summary
+from canwall.cycle.timing import observe_ns
 from canwall.cycle.transport import CycleFrames, Transport
 from canwall.cycle.trips import Trip
 from canwall.cycle.way_out import Outcome, run_loop
+from canwall.record.histogram import HISTOGRAM, buckets_ns, percentile_ns, timing_summary
 
 __all__ = [
     "CYCLE",
@@ -62,6 +64,7 @@ __all__ = [
     "set_wall",
     "start_at",
     "step",
+    "stiffest_for",
     "timing_summary",
     "with_law",
 ]

@@ -1,28 +1,32 @@
 """One drive with its wall; several may share a SYNC."""
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from canwall.config import Limits, Settings, Wall
+from canwall.config import Guard, Limits, Operator, Settings, Wall
 from canwall.cycle.core import DRIVE_FRAMES
-from canwall.cycle.state import make_cycle, modelled_delay
-from canwall.cycle.timing import HISTOGRAM
+from canwall.cycle.state import make_cycle, modelled_delay, withdraw_wall
 from canwall.cycle.trips import Trip
 from canwall.drive import DriveNode, DriveSetup
 from canwall.record import ROW, Phase, Ring
+from canwall.record.controls import Controls
+from canwall.record.histogram import HISTOGRAM
 from canwall.walls import Law
 
 
 @dataclass(frozen=True)
 class WallStage:
-    """Wall and limits in force from cycle j on."""
+    """Wall, limits and so on in force from cycle j on; None: as before."""
 
     j: int
     wall: Wall
     limits: Limits
+    guard: Guard | None = None
+    operator: Operator | None = None
 
 
 @dataclass
@@ -33,7 +37,10 @@ class Offer:
         revision: Revision of the wall in force against which it was judged.
         wall: Wall after the change.
         limits: Limits after it.
+        guard: Guard after it.
+        operator: Identification of the operator after it.
         turns: Walls that alternate after it.
+        begins_turns: True if they begin to alternate with it.
         since: Cycle from which on it is in force.
         outdated: True if another change came first.
     """
@@ -41,7 +48,10 @@ class Offer:
     revision: int
     wall: Wall
     limits: Limits
+    guard: Guard
+    operator: Operator
     turns: list[Wall]
+    begins_turns: bool = False
     since: int | None = None
     outdated: bool = False
 
@@ -62,8 +72,14 @@ class WallAxis:
     revision: int = 0
     #: Reason from outside the cycle to give up the wall; empty if there is none.
     reported: str = ""
-    #: Number of the next of the alternating walls.
+    #: Strikes after which the next of the alternating walls comes, and before the first of them.
     next_turn: int = 1
+    turns_since: int = 0
+    #: Words with which other processes act on the run.
+    controls: Controls | None = None
+    #: Time without a beat after which the wall is withdrawn [s], 0: none; since when it is watched.
+    beat_timeout_s: float = 0.0
+    beat_since_ns: int = 0
 
     def __post_init__(self) -> None:
         self.cycle: NDArray[np.void] = make_cycle(self.settings, self.setup, self.laws)
@@ -74,6 +90,7 @@ class WallAxis:
         self.latency, self.sync_to_rpdo = np.zeros(1, HISTOGRAM), np.zeros(1, HISTOGRAM)
         self.delay = modelled_delay(self.settings)
         self.wall, self.limits = self.settings.wall, self.settings.limits
+        self.guard, self.operator = self.settings.guard, self.settings.operator
         self.turns = self.settings.laws_in_turn(self.settings.wall)
 
     @property
@@ -111,6 +128,33 @@ class WallAxis:
             self.reported = text
             self.cycle["trip"] = np.int64(Trip.REPORTED)
 
+    def open_controls(self, controls: Controls) -> None:
+        """Have the compiled core look at words of control in every cycle from now on."""
+        self.controls = controls  # whose memory lives as long as this
+        self.frames["controls"] = controls.words.ctypes.data
+
+    def watch_beat(self, timeout_s: float) -> None:
+        """Withdraw the wall once other processes give no sign of life for that time; 0: never."""
+        self.beat_since_ns = time.monotonic_ns()
+        self.beat_timeout_s = timeout_s
+
+    def look_at_beat(self) -> None:
+        """Withdraw the wall if a sign of life is overdue; any thread may call this."""
+        if not self.beat_timeout_s or self.controls is None or self.withdrawn:
+            return
+        silent_s = self.controls.silent_s(self.beat_since_ns)
+        if silent_s > self.beat_timeout_s:
+            self.reported = self.reported or (
+                f"no beat from the panel for {silent_s:.2g} s, {self.beat_timeout_s:g} s is the "
+                f"most: the wall was ramped down"
+            )
+            withdraw_wall(self.cycle, round(self.settings.run.blend_s / self.settings.bus.cycle_s))
+
+    @property
+    def withdrawn(self) -> bool:
+        """True once the wall is being ramped down."""
+        return bool(self.cycle["share_falls"][0])
+
     def take_offer(self) -> Offer | None:
         """Take the requested change out, if there is one and nobody else has taken it."""
         try:
@@ -121,6 +165,11 @@ class WallAxis:
     @property
     def measures_delay(self) -> bool:
         """True if the delay has to be measured before the wall is rendered."""
-        estimator = self.settings.estimator
-        known = estimator.delay_cycles is not None or self.setup.synchronous
-        return estimator.measure_delay or not known
+        estimator, drive = self.settings.estimator, self.settings.drive
+        if estimator.measure_delay is True:
+            return True
+        if estimator.delay_cycles is not None:
+            return False
+        # Laws without a model need no more than that it is about a period.
+        lags = drive.current_bandwidth_hz == 0.0 and not all(law.sampled for law in self.laws)
+        return not self.setup.synchronous or (estimator.measure_delay == "auto" and lags)

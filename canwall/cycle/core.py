@@ -16,9 +16,12 @@ from canwall.bus.raw_socket import CAN_EFF, CAN_ERR, CAN_RTR, elements
 from canwall.compiled import Record, compiled
 from canwall.cycle.state import CYCLE
 from canwall.cycle.step import step
-from canwall.cycle.timing import HISTOGRAM, observe_ns
-from canwall.record.append import put_frame, put_row
+from canwall.cycle.timing import observe_ns
+from canwall.cycle.trips import stop
+from canwall.record.append import load_acquire, put_frame, put_row
 from canwall.record.columns import ROW
+from canwall.record.controls import CONTROLS
+from canwall.record.histogram import HISTOGRAM
 from canwall.record.ring import (
     ERROR,
     EXTENDED,
@@ -107,6 +110,7 @@ DRIVE_FRAMES = np.dtype(
         ("sync_to_rpdo", "u8"),
         ("header", "u8"),
         ("rows", "u8"),
+        ("controls", "u8"),  # words of other processes (address 0: none)
         ("awaited", "?"),
         ("received_ns", "i8"),  # when the TPDO arrived, or counted as missing
         ("late_rpdo", "i8"),
@@ -133,6 +137,7 @@ CORE = np.dtype(
         ("stage", "i8"),
         ("retired", "?"),  # no more frames, even if a call that was given up comes back
         ("left", "i8"),  # remaining cycles
+        ("single", "?"),  # only one cycle at a time, whatever was requested
         ("wall_offset_ns", "i8"),  # CLOCK_REALTIME less CLOCK_MONOTONIC
         # SYNC
         ("real_time", "?"),
@@ -386,8 +391,10 @@ def _answer(core: Record, k: int, data: int, received: bool, received_ns: int) -
     drive: Record = elements(core.drives, core.drives_length, DRIVE_FRAMES)[k]
     drive.awaited = False
     drive.received_ns = received_ns
-    rows = elements(drive.row, 1, ROW)
-    answer = step(elements(drive.cycle, 1, CYCLE), rows, data, received)
+    cycles, rows = elements(drive.cycle, 1, CYCLE), elements(drive.row, 1, ROW)
+    if drive.controls and load_acquire(elements(drive.controls, 1, CONTROLS)[0], "stop"):
+        stop(cycles[0])
+    answer = step(cycles, rows, data, received)
     if core.retired:
         return _DONE
     core.answered = k
@@ -512,9 +519,9 @@ def _record_is_behind(core: Record) -> bool:
 
 @compiled
 def _wants_python(core: Record) -> bool:
-    """Return True if Python has to act before the next cycle (trip, end of a strike, frames)."""
+    """Return True if Python has to act before the next cycle (a request, trip, strike or frame)."""
     inbox: Record = elements(core.inbox_header, 1, HEADER)[0]
-    if inbox.frame_head != inbox.frame_tail:
+    if core.single or inbox.frame_head != inbox.frame_tail:
         return True
     drives = elements(core.drives, core.drives_length, DRIVE_FRAMES)
     for k in range(len(drives)):

@@ -21,11 +21,11 @@ from canwall.cycle.axis import WallAxis
 from canwall.cycle.core import CORE, DRIVE_FRAMES, INBOX, Handling, Want
 from canwall.cycle.python_can import PythonCanTransport
 from canwall.cycle.step import step
-from canwall.cycle.timing import HISTOGRAM
 from canwall.cycle.transport import CycleFrames, TransportFactory
 from canwall.drive import Link, Watchdog
 from canwall.drive.watchdog import ErrorControlFrame
 from canwall.record import Phase
+from canwall.record.histogram import HISTOGRAM
 from canwall.record.ring import FRAME, HEADER, RECEIVED, Ring, to_message
 
 #: Time after which a TPDO counts as lost in simulated time, where nothing is late.
@@ -223,6 +223,10 @@ class Exchange:
         """A value that changes as long as a call of `cycle` gets on, and frames come and go."""
         at = [(int(a.cycle["j"][0]), int(a.cycle["evaluated"][0])) for a in self.axes]
         return (self.link.turns, *itertools.chain(*at))
+
+    def attend(self) -> None:
+        """Return from `cycle` after each single one from now on; another thread may call this."""
+        self._core["single"] = True
 
     def retire(self) -> None:
         """Send no more frames, although a call of `cycle` may still come back."""

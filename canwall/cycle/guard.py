@@ -5,7 +5,8 @@ be known:
 
 - **Ripple that does not decay.** The force within 20 to 500 Hz (theory, section 5) has swung a
   dozen times by more than RIPPLE_NM: within 100 ms of which no 20 ms were much quieter than the
-  others, or within 200 ms without falling to half. A bounce dies away.
+  others, or within 200 ms without falling to half. A bounce dies away. While the force is lowered,
+  half of either time is enough.
 - **A contact that gives off more than it took.** The wall has put out more energy than the operator
   put in, and the handle leaves faster than it came. Either alone is no sign: a hand that withdraws
   leaves faster, and on a soft wall friction takes what sampling adds. While the force is lowered,
@@ -16,6 +17,7 @@ together, at once. After HOLD_S without a further one the factor rises again, by
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,6 +95,13 @@ GUARD = np.dtype(
 )
 
 
+#: What it has observed of the motion and the force.
+_OBSERVED = (
+    *("states", "filled", "side", "peak", "squares", "swung", "peaks", "amplitudes", "swings"),
+    *("inside", "lasted", "work", "taken", "largest", "way_in"),
+)
+
+
 def set_guard(guard: NDArray[np.void], action: str, period: float, count: float) -> None:
     """Write a guard for this period of the SYNC [s] and encoder count [rad]; no alarm yet.
 
@@ -106,28 +115,60 @@ def set_guard(guard: NDArray[np.void], action: str, period: float, count: float)
     guard["hold"] = round(HOLD_S / period)
     guard["longest"] = round(BOUNCE_S / period)
     guard["rise"] = math.exp(period / RISE_S)
-    if guard["action"] != _OFF:
-        guard["sections"] = band_pass(period)
+    guard["sections"] = band_pass(period)
+
+
+def change_guard(guard: np.void, action: str, position: float) -> None:
+    """Change the action between two cycles; what was observed before it was off is forgotten.
+
+    A force that has been lowered rises as it does without an alarm, also where the guard is off.
+
+    Args:
+        guard: Record of dtype GUARD.
+        action: `[guard] action`.
+        position: Position of the handle, oriented towards the wall [rad].
+    """
+    if guard["action"] == _OFF:
+        for name in _OBSERVED:
+            guard[name] = 0
+        guard["way"], guard["outside"] = position, _SPAN + 1
+    guard["action"] = GUARD_ACTIONS[action]
 
 
 def band_pass(period: float) -> NDArray[np.float64]:
     """Return two second-order sections for the band, or what of it a sampled force can have.
 
     At 40 Hz and below that is nothing, and nothing passes: fed contacts are left to be seen.
-    """
-    from scipy.signal import butter  # slow to import: not for a run without a guard
 
+    The filters are Butterworth ones of second order by the bilinear transform, as those of
+    scipy.signal.butter, which takes too long to load for a run in progress.
+    """
     low, high = FELT_BAND_HZ
-    rate = 1.0 / period
-    if high < 0.45 * rate:
-        return np.asarray(butter(2, (low, high), "bandpass", fs=rate, output="sos"))
     sections = np.zeros((2, 6))
     sections[:, 3] = 1.0
-    if low >= 0.5 * rate:
+    if low * period >= 0.5:
         return sections
-    sections[:, 0] = 1.0
-    sections[0] = butter(2, low, "highpass", fs=rate, output="sos")[0]
+    rate = 2.0 / period
+    below, above = (rate * math.tan(math.pi * edge * period) for edge in (low, high))
+    if high * period >= 0.45:
+        sections[0] = _sampled([1.0, 0.0, 0.0], [1.0, math.sqrt(2.0) * below, below**2], rate)
+        sections[1, 0] = 1.0
+        return sections
+    # s → (s² + ω₁·ω₂) / (s·(ω₂ − ω₁)) makes the low-pass a band-pass: each of its poles becomes
+    # two, and those of its conjugate are their conjugates.
+    width, pole = above - below, complex(-math.sqrt(0.5), math.sqrt(0.5))
+    for section, root in zip(
+        sections, np.roots([1.0, -pole * width, below * above]).tolist(), strict=True
+    ):
+        section[:] = _sampled([0.0, width, 0.0], [1.0, -2.0 * root.real, abs(root) ** 2], rate)
     return sections
+
+
+def _sampled(above: Sequence[float], below: Sequence[float], rate: float) -> NDArray[np.float64]:
+    """Return a second-order section for a fraction of polynomials in s, by s = rate·(z−1)/(z+1)."""
+    of_z = np.array([[rate**2, rate, 1.0], [-2.0 * rate**2, 0.0, 2.0], [rate**2, -rate, 1.0]])
+    section = np.concatenate([of_z @ above, of_z @ below])
+    return np.asarray(section / section[3])
 
 
 @compiled
@@ -144,7 +185,10 @@ def watch(
         force: Force from the SYNC before up to this one, out of the wall [N·m].
         rendering: False before and after the wall: nothing is observed.
     """
-    if guard.action == _OFF or not rendering:
+    if not rendering:
+        return
+    if guard.action == _OFF:
+        guard.factor = min(1.0, guard.factor * guard.rise)
         return
     left = 1.0
     if _ripples(guard, force):
@@ -182,9 +226,12 @@ def _ripples(guard: Record, force: float) -> bool:
     _push(guard.amplitudes, math.sqrt(2.0 * guard.squares / guard.block))
     _push(guard.swings, guard.swung)
     guard.peak = guard.squares = guard.swung = 0.0
-    blocks = guard.filled // guard.block
-    return (blocks >= STEADY_BLOCKS and _lasts(guard, guard.amplitudes, STEADY_BLOCKS, STEADY)) or (
-        blocks >= LASTING_BLOCKS and _lasts(guard, guard.peaks, LASTING_BLOCKS, LASTING)
+    # A wall that has been softened and buzzes on is not given as long again.
+    sooner = 2 if guard.factor < 1.0 else 1
+    steady, lasting = STEADY_BLOCKS // sooner, LASTING_BLOCKS // sooner
+    blocks, swings = guard.filled // guard.block, SWINGS // sooner
+    return (blocks >= steady and _lasts(guard, guard.amplitudes, steady, STEADY, swings)) or (
+        blocks >= lasting and _lasts(guard, guard.peaks, lasting, LASTING, swings)
     )
 
 
@@ -196,14 +243,16 @@ def _push(newest_first: NDArray[np.float64], value: float) -> None:
 
 
 @compiled
-def _lasts(guard: Record, levels: NDArray[np.float64], blocks: int, share: float) -> bool:
+def _lasts(
+    guard: Record, levels: NDArray[np.float64], blocks: int, share: float, least_swings: int
+) -> bool:
     """Return whether no block of the last ones is quiet, or much quieter than the loudest."""
     least = largest = levels[0]
     swings = 0.0
     for k in range(blocks):
         least, largest = min(least, levels[k]), max(largest, levels[k])
         swings += guard.swings[k]
-    return least >= max(RIPPLE_NM, share * largest) and swings >= SWINGS
+    return least >= max(RIPPLE_NM, share * largest) and swings >= least_swings
 
 
 @compiled

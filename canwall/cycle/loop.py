@@ -9,14 +9,20 @@ from contextlib import suppress
 from canwall.cycle.axis import WallAxis, WallStage
 from canwall.cycle.exchange import Exchange
 from canwall.cycle.experiment import Experiment, ExperimentError
-from canwall.cycle.state import fade_in, fade_over, set_limits, set_wall, start_at
+from canwall.cycle.state import (
+    fade_in,
+    fade_over,
+    set_limits,
+    set_wall,
+    set_watching,
+    start_at,
+)
 from canwall.cycle.trip_text import latest_emergency, shown_state, trip_text
 from canwall.cycle.trips import Trip
 from canwall.drive import (
     Controlword,
     DriveState,
     Enabling,
-    controlword_down,
     disable,
     disarm,
     state_of,
@@ -93,6 +99,7 @@ class Loop:
     def interrupt(self) -> None:
         """End the wall as `stop` would; another thread may call this."""
         self._interrupted = True
+        self.exchange.attend()
 
     def stops(self) -> bool:
         """Return True if the run is to end."""
@@ -234,6 +241,7 @@ class Loop:
 
     def _check(self) -> None:
         for axis in self._axes:
+            axis.look_at_beat()
             if axis.cycle["trip"][0]:
                 raise WallGivenUpError(self._say(axis, trip_text(axis, self.exchange)))
 
@@ -250,11 +258,12 @@ class Loop:
                 axis.cycle["controlword"] = Controlword.QUICK_STOP
             self.exchange.cycle()
         unheard = any(axis.cycle["trip"][0] == Trip.TORQUE for axis in self._axes)
+        # By way of SWITCHED ON a drive may slow the handle down first, with a torque of its own
+        # (0x605C).
+        for axis in self._axes:
+            axis.cycle["controlword"] = Controlword.DISABLE_VOLTAGE
         patience = max(_LEAVE_CYCLES, round(_LEAVE_S / self._period))
         for _ in range(_LAST_RPDOS if unheard else patience):
-            for axis in self._axes:
-                state = state_of(int(axis.cycle["statusword"][0]))
-                axis.cycle["controlword"] = controlword_down(state)
             if all(_is_down(axis) for axis in self._axes):
                 return True
             if all(_is_down(axis) or _is_silent(axis) for axis in self._axes):
@@ -326,11 +335,13 @@ def _change(axis: WallAxis, changes: list[WallStage], period: float) -> None:
     due = bool(changes) and changes[0].j <= j
     turns = len(axis.turns) > 1 and cycle["strikes"][0] >= axis.next_turn
     if turns:
-        axis.wall = axis.turns[axis.next_turn % len(axis.turns)]
+        axis.wall = axis.turns[(axis.next_turn - axis.turns_since) % len(axis.turns)]
         axis.next_turn += 1
     while changes and changes[0].j <= j:
         change = changes.pop(0)
         axis.wall, axis.limits = change.wall, change.limits
+        axis.guard = change.guard or axis.guard
+        axis.operator = change.operator or axis.operator
         axis.turns = axis.settings.laws_in_turn(change.wall)
     if not (due or turns) and not _accept_offer(axis, j):
         return
@@ -338,6 +349,7 @@ def _change(axis: WallAxis, changes: list[WallStage], period: float) -> None:
     fade_over(cycle, round(axis.settings.run.blend_s / period))
     set_wall(cycle, axis.wall, axis.laws)
     set_limits(cycle, axis.limits)
+    set_watching(cycle, axis.guard, axis.operator)
 
 
 def _accept_offer(axis: WallAxis, j: int) -> bool:
@@ -349,6 +361,10 @@ def _accept_offer(axis: WallAxis, j: int) -> bool:
         offer.outdated = True
         return False
     axis.wall, axis.limits, axis.turns = offer.wall, offer.limits, offer.turns
+    axis.guard, axis.operator = offer.guard, offer.operator
+    if offer.begins_turns:
+        axis.turns_since = int(axis.cycle["strikes"][0])
+        axis.next_turn = axis.turns_since + 1
     offer.since = j
     return True
 

@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 #: Priority above all normal threads and below the kernel's interrupt threads (50).
 _PRIORITY = 45
+#: What limits.conf has to allow: the thread that looks at the loop is a step above it.
+_ALLOWED = _PRIORITY + 1
 
 
 class Grant(NamedTuple):
@@ -41,11 +43,11 @@ def real_time_priority(above_loop: bool = False) -> Iterator[Grant]:
     wanted = _PRIORITY + above_loop
     granted = _raise_priority(wanted)
     if not granted:
-        yield Grant("no real-time priority", limits_line("rtprio", _PRIORITY))
+        yield Grant("no real-time priority", limits_line("rtprio", _ALLOWED))
         return
     try:
         low = granted < wanted
-        advice = limits_line("rtprio", _PRIORITY) if low else ""
+        advice = limits_line("rtprio", _ALLOWED) if low else ""
         yield Grant(f"SCHED_FIFO, priority {granted}", advice)
     finally:
         try:

@@ -10,16 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.analysis.metrics import STRIKE_GAP_S
-from canwall.config import Limits, Settings, Wall
-from canwall.cycle.guard import GUARD, set_guard
+from canwall.config import Guard, Limits, Operator, Settings, Wall
+from canwall.cycle.guard import GUARD, change_guard, set_guard
 from canwall.drive import DriveSetup, PdoLayout
 from canwall.drive import objects as od
 from canwall.walls import (
     BANK,
     ESTIMATOR,
+    MAX_DELAY,
     TENSION,
     WALL,
+    ElasticShaft,
     Law,
+    WallLoop,
     clear_memory,
     find_law,
     force_walk_of,
@@ -30,6 +33,7 @@ from canwall.walls import (
     set_estimator,
     set_plant,
     set_referent,
+    stiffest_wall,
 )
 
 #: Largest number of laws in a run.
@@ -43,8 +47,13 @@ SYNCHRONOUS_DELAY = 1.0
 
 #: Random walk of a force, for a hand that is known [N·m/√s].
 _FORCE_WALK = 0.2
-#: Delay below which the filter of an unknown hand becomes no quicker [periods].
-_SHORTEST_DELAY = 0.5
+#: Largest bandwidth of a filter on an elastic shaft, as a part of the resonance.
+_FILTER_PART = 0.125
+#: Bandwidth of the filter of the lightest hand, over that of one which follows within the delay,
+#: and the delay below which it becomes no quicker [periods].
+_QUICKNESS, _SHORTEST_DELAY = 0.85, 0.5
+#: What the model has more than the delay that is told where the hand is unknown [periods].
+_DELAY_MARGIN = 0.1
 #: Missed motion below this is ignored, since a coarse encoder stays on one count for long [counts].
 _STUCK_COUNTS = 8
 #: Tolerance for rounding, one count at each end of a cycle.
@@ -117,6 +126,7 @@ CYCLE = np.dtype(
         ("guard", GUARD, (1,)),
         ("estimator", ESTIMATOR, (1,)),
         ("bank", BANK, (1,)),
+        ("shaft", "f8", (4,)),  # fields of ElasticShaft; zero: rigid
         # The estimator for TPDOs that are a cycle late since one was missing, and the one for a
         # TPDO that was lost, both without the bank: while they are being compared, how much
         # likelier the first has been; the number of cycles that was found.
@@ -129,6 +139,10 @@ CYCLE = np.dtype(
         ("phase", "i8"),
         ("controlword", "i8"),
         ("test_per_mille", "i8"),
+        # Part of the wall's force that is left, and how much of it goes in a cycle, as the wall
+        # is withdrawn.
+        ("share", "f8"),
+        ("share_falls", "f8"),
         # Reports of the transport: SYNCs skipped before this one; a second TPDO since the last one.
         ("skipped", "i8"),
         ("overtaken", "?"),
@@ -177,6 +191,7 @@ def make_cycle(settings: Settings, setup: DriveSetup, laws: Sequence[Law]) -> ND
     UnknownLawError for options that a law does not have.
     """
     cycle = np.zeros(1, CYCLE)
+    cycle["share"] = 1.0
     for name, layout, index in (
         ("in_position", setup.tpdo, od.POSITION_ACTUAL_VALUE),
         ("in_statusword", setup.tpdo, od.STATUSWORD),
@@ -237,20 +252,30 @@ def _hands(settings: Settings) -> tuple[NDArray[np.float64], NDArray[np.float64]
 
 
 def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None:
-    """Reset the estimator for a delay of `delay` periods. Raises ValueError."""
+    """Reset the estimator for a delay of `delay` periods, and its margin. Raises ValueError."""
+    margin = settings.estimator.delay_margin_cycles
+    if margin is None:
+        margin = _DELAY_MARGIN if settings.operator.adapt else 0.0
+    margin = max(min(margin, MAX_DELAY - delay), 0.0)
+    delay += margin
     mass, viscous, spring = _model(settings)
     coulomb, period = settings.mechanics.coulomb_nm, settings.bus.cycle_s
     count = float(cycle["rad_per_count"][0])
-    force_walk = settings.estimator.force_walk_nm_per_sqrt_s or _FORCE_WALK
+    shaft = _shaft(settings)
+    cycle["shaft"] = shaft or 0.0
+    bandwidth = _FILTER_PART * 2.0 * math.pi * shaft.resonance_hz if shaft else math.inf
+    force_walk = settings.estimator.force_walk_nm_per_sqrt_s
     if settings.operator.adapt:
         masses, dampings = _hands(settings)
-        if settings.estimator.force_walk_nm_per_sqrt_s is None:
-            # A filter that follows within the delay is as quick as the loop can bear.
-            bandwidth = 1.0 / (max(delay, _SHORTEST_DELAY) * period)
-            force_walk = force_walk_of(bandwidth, masses[0], period, abs(count))
-        bank = cycle["bank"][0]
-        set_bank(bank, masses, dampings, spring, period, count, force_walk, delay)
         mass, viscous, coulomb = masses[0], dampings[0], 0.0
+        bandwidth = min(bandwidth, _QUICKNESS / (max(delay, _SHORTEST_DELAY) * period))
+    if force_walk is None:
+        force_walk = _FORCE_WALK
+        if bandwidth < math.inf:
+            force_walk = force_walk_of(bandwidth, mass, period, abs(count))
+    if settings.operator.adapt:
+        bank = cycle["bank"][0]
+        set_bank(bank, masses, dampings, spring, period, count, force_walk, delay, shaft, margin)
     set_estimator(
         cycle["estimator"][0],
         mass,
@@ -261,8 +286,67 @@ def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None
         count,
         force_walk,
         delay,
+        margin,
     )
+    _bound_by_shaft(cycle)
     _reset(cycle, float(cycle["oriented"][0]))
+
+
+def _shaft(settings: Settings) -> ElasticShaft | None:
+    """Return the shaft of the model, None for a rigid one."""
+    mechanics = settings.mechanics
+    if not mechanics.shaft_hz:
+        return None
+    assert mechanics.rotor_inertia_kg_m2 is not None
+    return ElasticShaft(
+        mechanics.inertia_kg_m2,
+        mechanics.rotor_inertia_kg_m2,
+        mechanics.shaft_hz,
+        mechanics.shaft_damping_ratio,
+    )
+
+
+def _bound_by_shaft(cycle: NDArray[np.void]) -> None:
+    """Set the stiffness of the stiffest wall on an elastic shaft, for each hand."""
+    shaft = ElasticShaft(*cycle["shaft"][0].tolist())
+    rendered, bank, estimator = (cycle[name][0, 0] for name in ("rendered", "bank", "estimator"))
+    wall = rendered["wall"]
+    if not (shaft.resonance_hz and wall["cap"][0]):
+        return
+    before, period = estimator["before"]["duration"], cycle["period"].item()
+    closing = (
+        bool(rendered["sampled"]),
+        wall["asked_damping"].item(),
+        wall["damping_ratio"].item(),
+        period,
+        estimator["delay_periods"].item() + before.item() / period,
+    )
+    n = bank["count"].item()
+    for i in range(n):
+        mass = math.exp(bank["log_lightest"] + i * bank["log_step"])
+        gain = tuple(bank["gain"][:, i].tolist())
+        loop = WallLoop(mass, bank["viscous"][i].item(), gain, *closing)
+        bank["stiffest"][i] = stiffest_wall(shaft, loop)
+    if n:
+        wall["stiffest"] = np.interp(bank["place"], np.arange(n), bank["stiffest"][:n])
+    else:
+        known = estimator["mass"].item(), estimator["viscous"].item()
+        gain = tuple(estimator["steady_gain"].tolist())
+        wall["stiffest"] = stiffest_wall(shaft, WallLoop(*known, gain, *closing))
+
+
+def stiffest_for(cycle: NDArray[np.void], mass: float) -> float:
+    """Return the stiffness of the stiffest wall on the shaft in a hand, inf for a rigid one.
+
+    Args:
+        cycle: An array of dtype CYCLE, shape (1,).
+        mass: Inertia of all that moves [kg·m²].
+    """
+    bank = cycle["bank"][0, 0]
+    if not (n := bank["count"].item()):
+        return float(cycle["rendered"][0, 0]["wall"]["stiffest"][0])
+    place = (math.log(mass) - bank["log_lightest"]) / bank["log_step"]
+    return float(np.interp(place, np.arange(n), bank["stiffest"][:n]))
 
 
 def _reset(cycle: NDArray[np.void], oriented: float) -> None:
@@ -290,6 +374,10 @@ def set_limits(cycle: NDArray[np.void], limits: Limits) -> None:
     jump = limits.jump_rad or limits.speed_rad_s * period
     cycle["jump_limit"] = jump + _JUMP_COUNTS * abs(count)
     stuck = max(limits.stuck_rad, _STUCK_COUNTS * abs(count))
+    shaft = ElasticShaft(*cycle["shaft"][0].tolist())
+    if shaft.rotor:
+        # What stops a handle slowly stops a rotor in no time.
+        stuck *= shaft.inertia / shaft.rotor
     cycle["stuck_limit"] = stuck if limits.stuck_rad else math.inf
     cycle["stuck_cycles"] = limits.stuck_cycles
     error = limits.torque_error_nm
@@ -323,9 +411,26 @@ def set_wall(cycle: NDArray[np.void], wall: Wall, laws: Sequence[Law]) -> None:
     known["damping_ratio"], known["cap"] = wall.damping_ratio or 0.0, wall.cap or 0.0
     known["tension"] = TENSION[wall.tension]
     known["passivity_damping"] = wall.passivity_nm_s_per_rad
+    _bound_by_shaft(cycle)
     if index != rendered["law"]:
         rendered["law"] = index
         clear_memory(known)
+
+
+def set_watching(cycle: NDArray[np.void], guard: Guard, operator: Operator) -> None:
+    """Change what observes wall and hand between two cycles."""
+    change_guard(cycle["guard"][0, 0], guard.action, cycle["oriented"].item())
+    cycle["bank"]["holds"] = not operator.adapt
+
+
+def withdraw_wall(cycle: NDArray[np.void], cycles: int) -> None:
+    """Let the wall's force fall to zero within `cycles` or, at the torque rate, later; then trip.
+
+    The whole force falls, whatever is being blended into it. Another thread may call this.
+    """
+    torque = abs(cycle["torque_per_mille"].item() * cycle["nm_per_mille"].item())
+    rate = cycle["torque_rate"].item() * cycle["period"].item()
+    cycle["share_falls"] = 1.0 / max(cycles, math.ceil(torque / rate), 1)
 
 
 def fade_over(cycle: NDArray[np.void], cycles: int) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from canwall.compiled import Record, compiled
 from canwall.cycle.guard import watch
 from canwall.cycle.state import RECENT_CYCLES
-from canwall.cycle.trips import Trip, check_limits, compare_position, compare_torque
+from canwall.cycle.trips import Trip, check_limits, compare_position, compare_torque, withdraw
 from canwall.record import Phase
 from canwall.units import to_per_mille
 from canwall.walls import (
@@ -32,6 +32,7 @@ from canwall.walls import (
     set_model,
     stand_still,
     start_lagging,
+    stiffest,
     wall_force,
     with_probe,
 )
@@ -119,7 +120,10 @@ def _identify_operator(cycle: Record) -> None:
     """Let the bank learn from the sample; the walls' laws get the mass that it finds."""
     bank, estimator = cycle.bank[0], cycle.estimator[0]
     if correct_bank(bank, estimator, cycle.oriented):
-        change_plant(cycle.rendered[0].wall[0], estimator.mass, estimator.viscous)
+        wall = cycle.rendered[0].wall[0]
+        change_plant(wall, estimator.mass, estimator.viscous)
+        if bank.regression[0].rotor > 0.0:
+            wall.stiffest = stiffest(bank)
         if cycle.fade_left > 0:
             change_plant(cycle.faded[0].wall[0], estimator.mass, estimator.viscous)
         if cycle.compares_lag:
@@ -147,7 +151,7 @@ def _force_of(cycle: Record, rendered: Record, due: bool) -> float:
         cycle.evaluated = rendered.law + 1
         rendered.force = wall_force(cycle.laws[rendered.law], rendered.wall[0])
         cycle.evaluated = 0
-    return cycle.guard[0].factor * rendered.force
+    return cycle.share * cycle.guard[0].factor * rendered.force
 
 
 @compiled
@@ -236,6 +240,13 @@ def _wanted_force(cycle: Record, received: bool, due: bool) -> float:
     before = cycle.orientation * cycle.torque_per_mille * cycle.nm_per_mille
     most = cycle.torque_rate * cycle.period
     return min(max(force, before - most), before + most)
+
+
+@compiled
+def _torque_limit(cycle: Record) -> float:
+    """Return the limit of this torque; one that has been lowered is reached at the torque rate."""
+    before = abs(cycle.torque_per_mille * cycle.nm_per_mille)
+    return max(cycle.torque_limit, before - cycle.torque_rate * cycle.period)
 
 
 @compiled
@@ -343,6 +354,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     estimator = cycle.estimator[0]
     skipped = _stand_still(cycle)
     _end_lag(cycle)
+    withdraw(cycle)
     before, missed = cycle.counts, cycle.missed_in_a_row + skipped
     cycle.missed_recently = (cycle.missed_recently << 1) & _RECENT
     if received:
@@ -383,7 +395,8 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     if active:
         force = _wanted_force(cycle, received, due)
     demanded = 0.0 if cycle.bank[0].regression[0].probing else force
-    per_mille = to_per_mille(cycle.orientation * force, cycle.nm_per_mille, cycle.torque_limit)
+    limit = _torque_limit(cycle)
+    per_mille = to_per_mille(cycle.orientation * force, cycle.nm_per_mille, limit)
     torque = per_mille * cycle.nm_per_mille
     sent = cycle.orientation * torque
     if cycle.frozen and cycle.frozen < cycle.stuck_cycles:
@@ -429,7 +442,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     row.damping = wall.damping
     row.damping_ratio = wall.damping_ratio
     row.cap = wall.cap
-    row.stiffness_in_force = cycle.guard[0].factor * wall.stiffness
+    row.stiffness_in_force = cycle.share * cycle.guard[0].factor * wall.stiffness
     row.mass_est = estimator.mass
     row.mass_spread = cycle.bank[0].spread
     row.wall_position_rad = rendered.position

@@ -63,6 +63,8 @@ def trip_text(axis: WallAxis, exchange: Exchange) -> str:
             what = f"the drive left OPERATION ENABLED: {shown_state(axis)}{latest_emergency(axis)}"
         case Trip.REPORTED:
             what = axis.reported
+        case Trip.STOPPED:
+            what = "stopped from the panel"
         case _:
             what = _failed_law(axis)
     if trip in _FROM_POSITIONS:

@@ -26,6 +26,8 @@ class Trip(IntEnum):
     """A position that does not change by a single count although the handle is moving."""
     TORQUE = 10
     """A torque actual value (0x6077) that does not follow the target torque."""
+    STOPPED = 11
+    """The word of control with which another process stops the wall."""
 
 
 # The enums' values as plain numbers for the compiled code.
@@ -36,6 +38,8 @@ _ENERGY = int(Trip.ENERGY)
 _JUMP = int(Trip.JUMP)
 _STUCK = int(Trip.STUCK)
 _TORQUE = int(Trip.TORQUE)
+_REPORTED = int(Trip.REPORTED)
+_STOPPED = int(Trip.STOPPED)
 _LEAVING = int(Phase.LEAVING)
 _ENABLED_MASK, _ENABLED_VALUE = DriveState.OPERATION_ENABLED.value
 #: Statusword bit 11, internal limit active: the drive itself reports a reduced torque.
@@ -67,6 +71,23 @@ def check_limits(cycle: Record) -> None:
         cycle.trip = _ENERGY
     elif cycle.unfollowed >= cycle.torque_error_cycles:
         cycle.trip = _TORQUE
+
+
+@compiled
+def stop(cycle: Record) -> None:
+    """Set the trip of a wall that another process stops, in any phase but the way out."""
+    if cycle.trip == 0 and cycle.phase != _LEAVING:
+        cycle.trip = _STOPPED
+
+
+@compiled
+def withdraw(cycle: Record) -> None:
+    """Let the wall's force fall, if it is withdrawn, and set the trip at the end."""
+    if cycle.share_falls == 0.0 or cycle.phase == _LEAVING:
+        return
+    cycle.share = max(0.0, cycle.share - cycle.share_falls)
+    if cycle.share == 0.0 and cycle.trip == 0:
+        cycle.trip = _REPORTED
 
 
 @compiled

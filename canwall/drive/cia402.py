@@ -78,11 +78,6 @@ _UP = {
     DriveState.FAULT: Controlword.FAULT_RESET,
 }
 
-_DOWN = {
-    DriveState.OPERATION_ENABLED: Controlword.SWITCH_ON,  # transition 5, disable operation
-    DriveState.SWITCHED_ON: Controlword.SHUTDOWN,
-}
-
 
 def controlword_up(state: DriveState, previous: int) -> int:
     """Return the next controlword on the way to OPERATION ENABLED, from any state.
@@ -92,11 +87,6 @@ def controlword_up(state: DriveState, previous: int) -> int:
     if state is DriveState.FAULT and previous & Controlword.FAULT_RESET:
         return Controlword.DISABLE_VOLTAGE
     return _UP[state]
-
-
-def controlword_down(state: DriveState) -> int:
-    """Return the next controlword on the way to SWITCH ON DISABLED, from any state."""
-    return _DOWN.get(state, Controlword.DISABLE_VOLTAGE)
 
 
 #: Resets after which a fault that returns is considered permanent.

@@ -26,7 +26,15 @@ _DOUBLED = 3
 
 
 class DriveError(RunFailedError):
-    """A drive that does not answer, refuses a value, or stays in a state."""
+    """A drive that does not answer, refuses a value, or stays in a state.
+
+    Attributes:
+        troubles: What is wrong, a line each; the text of the error is all of them.
+    """
+
+    def __init__(self, *troubles: str) -> None:
+        super().__init__("; ".join(troubles))
+        self.troubles = troubles
 
 
 class DriveNode:
@@ -110,6 +118,10 @@ class DriveNode:
         variable = self.dictionary.get_variable(index, subindex)
         signed = variable is not None and variable.data_type in datatypes.SIGNED_TYPES
         return int.from_bytes(raw, "little", signed=signed)
+
+    def read_text(self, index: int, subindex: int = 0) -> str:
+        """Read a VISIBLE_STRING. Raises DriveError."""
+        return self._upload(index, subindex).decode("latin-1").rstrip("\0 ")
 
     def write(self, index: int, subindex: int, value: int, size: int | None = None) -> None:
         """Write an integer; its size in bytes is the dictionary's unless given.

@@ -68,7 +68,7 @@ def read_scales(
         try:
             return read()
         except DriveError as error:
-            troubles.append(str(error))
+            troubles.extend(error.troubles)
             return 1.0, ""
 
     gear, gear_source = found(lambda: _gear_ratio(node, settings))
@@ -79,11 +79,11 @@ def read_scales(
         _check_polarity(node)
         units = DriveUnits(counts, rated * gear)
     except DriveError as error:
-        troubles.append(str(error))
+        troubles.extend(error.troubles)
     except ValueError as error:
         troubles.append(f"node {node.node_id}: {error}; correct it in [drive]")
     if troubles:
-        raise DriveError("; ".join(troubles))
+        raise DriveError(*troubles)
     limit_nm = per_mille * units.nm_per_mille
     return Scales(
         units,

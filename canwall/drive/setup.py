@@ -112,10 +112,10 @@ def set_up(
             scales = read_scales(node, settings, identity, torque_nm)
         except DriveError as error:
             # What else has to be settled is said together with it.
-            troubles.append(str(error))
+            troubles.extend(error.troubles)
         prepared = _prepare(node, settings, bus, real_time, notes)
     except DriveError as error:
-        troubles.append(str(error))
+        troubles.extend(error.troubles)
     node.refuse_twin()
     if node.boot_ups > boot_ups:
         troubles.append(
@@ -124,7 +124,7 @@ def set_up(
         )
     differences = [*identity.doubts, *_absent(node)]
     if troubles or scales is None or prepared is None:
-        raise DriveError("; ".join([*troubles, *differences]))
+        raise DriveError(*troubles, *differences)
     node.command("OPERATIONAL")
     return DriveSetup(
         scales.units,

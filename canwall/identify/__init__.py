@@ -1,8 +1,9 @@
 """Identification of a servo, and of the operator who holds its handle, from their motion."""
 
-from canwall.identify.fit import Estimate, ServoFit, Shaft, UntellingDataError, fit_servo
+from canwall.identify.estimates import Estimate, ServoFit, Shaft, UntellingDataError
+from canwall.identify.fit import fit_servo
 from canwall.identify.hand import HandFit, fit_hand
-from canwall.identify.report import report_lines, toml_fragment, write_report
+from canwall.identify.report import json_content, report_lines, toml_fragment, write_report
 from canwall.identify.session import Identified, identify
 
 __all__ = [
@@ -15,6 +16,7 @@ __all__ = [
     "fit_hand",
     "fit_servo",
     "identify",
+    "json_content",
     "report_lines",
     "toml_fragment",
     "write_report",

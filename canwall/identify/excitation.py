@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.config import ConfigError, Settings
-from canwall.identify.fit import UntellingDataError
+from canwall.identify.estimates import UntellingDataError
 
 Array = NDArray[np.float64]
 
@@ -92,18 +92,23 @@ class Excitation:
         #: Mean square of the change of the speed from cycle to cycle, and the gain against it.
         self._jolt, self._gain = 0.0, 1.0
 
-    def next(self, position: float) -> float | None:
+    def next(self, position: float, periods: int = 1) -> float | None:
         """Return the torque after a position [N·m], None at the end.
 
-        Raises UntellingDataError if the handle is not where it should be, ConfigError at the start
-        if it has no room.
+        Args:
+            position: Latest position [rad].
+            periods: Periods since the position before; 0: there is none since the last call.
+
+        Raises:
+            UntellingDataError: If the handle is not where it should be.
+            ConfigError: If it has no room, at the start.
         """
         if self._torques is None:
             self._position, self._start = position, position
             self.bounds = Bounds.of(self._settings, position, self._largest)
             self._torques = self._all()
-        else:
-            moved = (position - self._position) / self._period
+        elif periods:
+            moved = (position - self._position) / (periods * self._period)
             self._jolt += 0.02 * ((moved - self._moved) ** 2 - self._jolt)
             self._moved = moved
             # Some smoothing: a coarse encoder has one count in many cycles.
@@ -245,6 +250,6 @@ class HandExcitation:
         torques = np.clip(0.5 * amplitude * one / one.std(), -amplitude, amplitude)
         self._torques = iter(np.resize(torques, round(self.duration_s / period)).tolist())
 
-    def next(self, position: float) -> float | None:
+    def next(self, position: float, periods: int = 1) -> float | None:
         """Return the torque of the next cycle [N·m], None at the end."""
         return next(self._torques, None)

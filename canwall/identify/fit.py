@@ -14,22 +14,16 @@ alone, which are found by variable projection. The response to the torque is the
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
-from scipy.ndimage import uniform_filter1d
 from scipy.optimize import least_squares
 
-from canwall.compiled import compiled
-from canwall.errors import RunFailedError
+from canwall.identify.estimates import Estimate, Residuals, ServoFit, Shaft, UntellingDataError
+from canwall.identify.pieces import PIECE, Pieces, steady_pieces
 
 Array = NDArray[np.float64]
 
-#: Samples of a piece: long enough for friction to move many counts, short enough for the residuals
-#: of forces outside the model not to add up.
-PIECE = 40
 #: Fewest pieces from which anything is concluded, and fewest in one direction.
 _FEWEST, _FEWEST_ONE_WAY = 60, 15
 #: Distance of two points of the cogging's map [rad], and how large an amplitude may be before the
@@ -43,262 +37,18 @@ _OUTLIER = 5.0
 _BLOCKS, _T_95 = 16, 2.131
 #: Share of the residuals that a shaft has to explain, and its coefficient in standard errors.
 _SHAFT_EXPLAINS, _SHAFT_SIGNIFICANCE = 0.03, 6.0
-#: Share of the motion that has to be explained, and largest relative half of the interval of the
-#: inertia.
-_EXPLAINED, _UNCERTAIN = 0.98, 0.1
-#: Largest delay and lag in a fit [periods].
-_MOST_DELAY, _MOST_LAG = 4.0, 3.0
+#: Share of the motion that may be neither explained nor the encoder's noise, and largest relative
+#: half of the interval of the inertia.
+_DISTURBED, _UNCERTAIN = 0.02, 0.1
+#: Power of an encoder's noise [steps²]: that of quantisation, and as much again.
+_NOISE = 2.0 / 12.0
+#: Largest delay and lag together in a fit [periods].
+_MOST_DELAY = 4.0
 #: Errors of the model that no residual shows: of the delay [periods], of the lag (relative) and of
 #: their sum [periods]; a shaft makes it harder to tell them apart.
 _APART, _APART_ELASTIC = (0.008, 0.05, 0.003), (0.02, 0.12, 0.006)
 #: Lags over which the residuals' autocorrelation is reported.
 _CORRELATED = 5
-
-
-class UntellingDataError(RunFailedError):
-    """Data that do not tell what was asked; the text gives the reason."""
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A value and half of its 95 % interval; the half is inf for what the data do not tell."""
-
-    value: float
-    half: float
-
-    @property
-    def low(self) -> float:
-        """Lower end of the interval."""
-        return self.value - self.half
-
-    @property
-    def high(self) -> float:
-        """Upper end of the interval."""
-        return self.value + self.half
-
-    def contains(self, value: float) -> bool:
-        """Return True for a value inside the interval."""
-        return self.low <= value <= self.high
-
-
-@dataclass(frozen=True)
-class Residuals:
-    """Rest of the measured positions, without what the model explains.
-
-    Attributes:
-        rms: Root of their mean square [encoder steps]; 0.29 is that of quantisation alone.
-        explained: Share of the motion in the pieces that the model explains.
-        correlation: Autocorrelation at lags 1, 2, …, shape (5,); zero for white residuals.
-        left_out: Share of the pieces that were left out as outliers.
-    """
-
-    rms: float
-    explained: float
-    correlation: Array
-    left_out: float
-
-    @property
-    def white(self) -> bool:
-        """True if the residuals have hardly any correlation."""
-        return bool(np.abs(self.correlation).max() < 0.2)
-
-
-@dataclass(frozen=True)
-class Shaft:
-    """Resonance of the shaft as the motor shows it: frequency [Hz], damping ratio, load/rotor."""
-
-    hz: Estimate
-    damping_ratio: Estimate
-    ratio: Estimate
-
-
-@dataclass(frozen=True)
-class ServoFit:
-    """A servo in SI units; torques are the commanded ones.
-
-    Attributes:
-        inertia: Of all that moves [kg·m²].
-        viscous: Viscous friction [N·m·s/rad].
-        forward: Coulomb friction, with any constant torque, of motion towards larger positions.
-        backward: The same towards smaller ones.
-        coulomb: Coulomb friction without the constant torque: mean of both.
-        delay: Pure delay from sample to torque [periods], the drive's own cycle included.
-        lag: Time constant of the current loop [s].
-        total: Delay and lag together [periods].
-        shaft: Resonance; None for a shaft that looks rigid.
-        cogging: Map of the cogging torque, shape (2, n): position [rad] and torque [N·m].
-        residuals: What is left.
-        shown: A stretch of the motion, shape (3, n): time [s], measured and model [rad].
-    """
-
-    inertia: Estimate
-    viscous: Estimate
-    forward: Estimate
-    backward: Estimate
-    coulomb: Estimate
-    delay: Estimate
-    lag: Estimate
-    total: Estimate
-    shaft: Shaft | None
-    cogging: Array
-    residuals: Residuals
-    shown: Array
-
-
-def steady_pieces(position: Array, period: float, step: float) -> tuple[NDArray[np.int64], Array]:
-    """Return first samples and directions of the pieces in which the handle does not reverse.
-
-    Args:
-        position: Positions at the SYNCs [rad], NaN where one is missing.
-        period: SYNC period [s].
-        step: Step of the encoder [rad].
-    """
-    moved = np.diff(position)
-    jolts = np.diff(moved)
-    # Between two samples the velocity differs from the mean by less than it changes over them.
-    power = uniform_filter1d(np.nan_to_num(jolts) ** 2, 2 * PIECE, mode="nearest")
-    jolt = np.sqrt(np.maximum(power, 0.0))
-    least = np.maximum(np.append(jolt, jolt[-1]), max(2.0 * step, 0.1 * period))
-    found: list[int] = []
-    signs: list[float] = []
-    for sign in (1.0, -1.0):
-        steady = np.nan_to_num(sign * moved, nan=-1.0) > least
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], steady.astype(int), [0]])))
-        for begin, end in edges.reshape(-1, 2):
-            # `end` moves have one position more.
-            pieces = range(int(begin), int(end) + 2 - PIECE, PIECE)
-            found += pieces
-            signs += [sign] * len(pieces)
-    order = np.argsort(found)
-    return np.array(found, np.int64)[order], np.array(signs)[order]
-
-
-@compiled
-def _respond(first: Array, second: Array, whole: int, torque: Array, response: Array) -> None:
-    """Follow a linear system whose input changes within each period.
-
-    first and second hold Φ and Γ, side by side, of the two parts of a period; row j of `response`
-    gets the position without spring, and the resonance's, at SYNC j.
-    """
-    order = len(first)
-    x, z = np.zeros(order), np.zeros(order)
-    for j in range(len(torque)):
-        response[j, 0] = x[1]
-        response[j, 1] = x[3]
-        before = torque[j - whole - 1] if j > whole else 0.0
-        after = torque[j - whole] if j >= whole else 0.0
-        for i in range(order):
-            z[i] = first[i, order] * before
-            for k in range(order):
-                z[i] += first[i, k] * x[k]
-        for i in range(order):
-            x[i] = second[i, order] * after
-            for k in range(order):
-                x[i] += second[i, k] * z[k]
-
-
-def torque_response(
-    torque: Array, period: float, delay: float, lag: float, hz: float, damping_ratio: float
-) -> Array:
-    """Return the motion of a unit inertia, and of a resonance, under commanded torques.
-
-    Args:
-        torque: Torque commanded after each SYNC [N·m], shape (n,).
-        period: SYNC period [s].
-        delay: From the SYNC until the torque changes [periods].
-        lag: Time constant of the current loop [s].
-        hz: Natural frequency of the resonance q̈ + 2ζω·q̇ + ω²·q = u.
-        damping_ratio: Its ζ.
-
-    Returns:
-        Positions at the SYNCs, shape (n, 2).
-    """
-    omega = 2.0 * math.pi * hz
-    rate = 1.0 / max(lag, 1e-4 * period)
-    # States: torque, position and velocity of the inertia, and of the resonance.
-    a = np.zeros((6, 6))
-    a[0, 0], a[0, 5] = -rate, rate
-    a[1, 2], a[2, 0] = 1.0, 1.0
-    a[3, 4] = 1.0
-    a[4, 0], a[4, 3], a[4, 4] = 1.0, -(omega**2), -2.0 * damping_ratio * omega
-    whole = math.floor(delay)
-    share = delay - whole
-    first, second = (
-        np.ascontiguousarray(expm(a * part * period)[:5]) for part in (share, 1.0 - share)
-    )
-    response = np.empty((len(torque), 2))
-    _respond(first, second, whole, torque, response)
-    return response
-
-
-class _Pieces:
-    """Regressors of the pieces: integrals of what acts, without what their beginnings explain.
-
-    `ringing` is frequency [Hz] and damping ratio of a shaft: friction that reverses makes it ring.
-    """
-
-    def __init__(
-        self,
-        position: Array,
-        torque: Array,
-        period: float,
-        first: NDArray[np.int64],
-        ringing: tuple[float, float] | None,
-    ) -> None:
-        self.torque, self.period = torque, period
-        self.at = first[:, None] + np.arange(PIECE)
-        self._position = position[self.at]
-        time = np.arange(PIECE) * period
-        of_start = [np.ones(PIECE), time]
-        if ringing is not None:
-            hz, damping_ratio = ringing
-            rate = 2.0 * math.pi * hz * complex(-damping_ratio, math.sqrt(1.0 - damping_ratio**2))
-            swing = np.exp(rate * time)
-            of_start += [swing.real, swing.imag]
-        explained, _ = np.linalg.qr(np.stack(of_start, axis=1))
-        self._without_start = np.eye(PIECE) - explained @ explained.T
-        self.free = PIECE - len(of_start)
-        # Exact for an integrand that is linear between two samples.
-        once = np.tril(np.ones((PIECE, PIECE))) * period
-        once[:, 0] -= 0.5 * period
-        once -= np.eye(PIECE) * 0.5 * period
-        once[0] = 0.0
-        inner = np.zeros((PIECE, PIECE))
-        for i in range(1, PIECE):
-            inner[i] = inner[i - 1] + period * once[i - 1]
-            inner[i, i - 1] += period**2 / 3.0
-            inner[i, i] += period**2 / 6.0
-        self._once, self._twice = self._without_start @ once, self._without_start @ inner
-        self.time = time
-
-    def flat(self, of_pieces: Array) -> Array:
-        """Return what the pieces' beginnings do not explain, one value after another."""
-        return np.asarray(of_pieces @ self._without_start.T).reshape(-1)
-
-    def measured(self) -> Array:
-        return self.flat(self._position - self._position[:, :1])
-
-    def velocity(self) -> Array:
-        """Return the regressor of b/m."""
-        return -np.asarray((self._position - self._position[:, :1]) @ self._once.T).reshape(-1)
-
-    def friction(self, here: NDArray[np.bool_], sign: float) -> Array:
-        """Return the regressor of c/m in the pieces that go one way."""
-        return self.flat(np.where(here[:, None], -0.5 * sign * self.time**2, 0.0))
-
-    def cogging(self, grid: Array) -> Array:
-        """Return the regressors of a torque that is linear between the points of a grid."""
-        columns = np.empty((self.at.size, len(grid)))
-        spacing = grid[1] - grid[0]
-        for k, point in enumerate(grid):
-            hat = np.maximum(1.0 - np.abs(self._position - point) / spacing, 0.0)
-            columns[:, k] = -(hat @ self._twice.T).reshape(-1)
-        return columns
-
-    def driven(self, delay: float, lag: float, hz: float, damping_ratio: float) -> Array:
-        """Return the regressors of 1/m and ρ/m, shape (samples, 2)."""
-        motion = torque_response(self.torque, self.period, delay, lag, hz, damping_ratio)[self.at]
-        return np.stack([self.flat(motion[:, :, k] - motion[:, :1, k]) for k in (0, 1)], axis=1)
 
 
 def fit_servo(position: Array, torque: Array, period: float, step: float) -> ServoFit:
@@ -339,10 +89,13 @@ def fit_servo(position: Array, torque: Array, period: float, step: float) -> Ser
 
 
 def _check_told(found: ServoFit) -> None:
-    explained, uncertain = found.residuals.explained, found.inertia.half / found.inertia.value
-    if explained < _EXPLAINED or uncertain > _UNCERTAIN:
+    residuals, uncertain = found.residuals, found.inertia.half / found.inertia.value
+    # A coarse encoder leaves much of a small motion unexplained, which nobody has disturbed.
+    disturbed = (1.0 - residuals.explained) * max(0.0, 1.0 - _NOISE / residuals.rms**2)
+    if disturbed > _DISTURBED or uncertain > _UNCERTAIN:
         raise UntellingDataError(
-            f"a free handle does not move like this: {explained:.1%} of the motion is explained, "
+            f"a free handle does not move like this: {residuals.explained:.1%} of the motion is "
+            f"explained, the residuals are {residuals.rms:.2g} steps of the encoder, "
             f"the inertia is known to {uncertain:.0%}; let it go, and see that nothing pulls at it"
         )
 
@@ -369,7 +122,7 @@ class _Fit:
         sign: Array,
         ringing: tuple[float, float] | None = None,
     ) -> None:
-        self._pieces = _Pieces(position, torque, period, first, ringing)
+        self._pieces = Pieces(position, torque, period, first, ringing)
         self._position, self._period, self._step = position, period, step
         self._first, self._sign = first, sign
         pieces = self._pieces
@@ -424,9 +177,9 @@ class _Fit:
 
     def _physical(self, x: Array) -> tuple[float, float, float, float]:
         """Return delay [periods], lag [s], frequency [Hz] and damping ratio."""
-        total, lag = float(x[0]), abs(float(x[1]))
+        total, share = float(x[0]), float(x[1])
         hz, ratio = (float(x[2]), float(x[3])) if len(x) > 2 else (0.25 / self._period, 0.5)
-        return max(total - lag, 0.0), lag * self._period, hz, ratio
+        return (1.0 - share) * total, share * total * self._period, hz, ratio
 
     def _solved(self, x: Array) -> tuple[Array, Array]:
         """Return the parameters of the driven motion, and the residuals [steps]."""
@@ -444,7 +197,7 @@ class _Fit:
 
     def refined(self, x: Array) -> Array:
         """Return the parameters that explain the motion best, from first ones."""
-        low, high = np.zeros(2), np.array([_MOST_DELAY, _MOST_LAG])
+        low, high = np.zeros(2), np.array([_MOST_DELAY, 1.0])
         if len(x) > 2:
             low = np.array([*low, 0.9 * x[2], 1e-3])
             high = np.array([*high, 1.1 * x[2], 0.7])
@@ -461,8 +214,9 @@ class _Fit:
         return np.asarray(found.x)
 
     def rigid(self) -> Array:
-        """Return delay plus lag, and lag [periods], of a rigid shaft."""
-        guesses = [np.array([total, min(0.1, 0.5 * total)]) for total in np.arange(0.1, 4.1, 0.25)]
+        """Return delay plus lag [periods], and the lag's share of it, of a rigid shaft."""
+        totals = np.arange(0.1, 4.1, 0.25)
+        guesses = [np.array([total, min(0.1 / total, 0.5)]) for total in totals]
         best = min(guesses, key=self._cost)
         return self.refined(best)
 
@@ -476,11 +230,12 @@ class _Fit:
         """Return the parameters with a resonance, None if the shaft looks rigid."""
         nyquist = 0.5 / self._period
         before = self._cost(rigid)
-        lag = min(rigid[1], 0.15)
+        lag = min(rigid[0] * rigid[1], 0.15)
+        totals = [max(rigid[0] - late, 0.05) for late in (0.0, 0.15)]
         guesses = [
-            np.array([max(rigid[0] - late, 0.05), lag, hz, 0.03])
+            np.array([total, min(lag / total, 1.0), hz, 0.03])
             for hz in np.geomspace(0.08 * nyquist, 1.6 * nyquist, 40)
-            for late in (0.0, 0.15)
+            for total in totals
         ]
         best = min(guesses, key=self._cost)
         if self._cost(best) > (1.0 - _SHAFT_EXPLAINS) * before:
@@ -567,8 +322,8 @@ class _Fit:
             estimate(lambda p: float(p[at + 1] / p[n]) + constant, 0.005, one_way),
             estimate(lambda p: float(p[at + 2] / p[n]) - constant, 0.005, one_way),
             estimate(lambda p: 0.5 * float((p[at + 1] + p[at + 2]) / p[n]), 0.005, force),
-            estimate(lambda p: float(p[0] - p[1]), 0.0, apart[0]),
-            estimate(lambda p: float(p[1]) * self._period, apart[1], 0.002 * self._period),
+            estimate(lambda p: float(p[0] * (1.0 - p[1])), 0.0, apart[0]),
+            estimate(lambda p: float(p[0] * p[1]) * self._period, apart[1], 0.002 * self._period),
             estimate(lambda p: float(p[0]), 0.0, apart[2]),
             shaft,
             cogging,
@@ -620,47 +375,3 @@ class _Fit:
         measured = self._position[at]
         model = measured - left.reshape(-1, PIECE)[some].reshape(-1) * self._step
         return np.stack([at * self._period, measured, model])
-
-
-def break_away(
-    position: Array, torque: Array, period: float, step: float, inertia: float, delay: float
-) -> tuple[Array, Array, Array]:
-    """Return where and at which torque a handle at rest broke loose, in a record of slow ramps.
-
-    Each ramp begins at zero torque. A handle that has just broken loose under a torque that rises
-    with r needs (6·s·m/r)^⅓ for its first steps s, or less if friction falls: the torque is that
-    at the middle of this time before they were seen.
-
-    Args:
-        position: Positions at the SYNCs [rad].
-        torque: Torques commanded after them [N·m].
-        period: SYNC period [s].
-        step: Step of the encoder [rad].
-        inertia: Inertia of the handle [kg·m²].
-        delay: From sample to torque [periods].
-
-    Returns:
-        Position [rad], torque [N·m], whose sign is its direction, and its uncertainty [N·m], one
-        for each ramp in which the handle broke loose.
-    """
-    found = []
-    starts = np.flatnonzero((torque[1:] != 0.0) & (torque[:-1] == 0.0))
-    for start, end in zip(starts, [*starts[1:], len(torque)], strict=True):
-        rest = position[start]
-        moved = np.flatnonzero(np.abs(position[start:end] - rest) > 3.0 * step)
-        if not len(moved) or moved[0] < 2:
-            continue
-        at = start + int(moved[0])
-        rate = (torque[at - 1] - torque[start]) / (moved[0] - 1) / period
-        if rate == 0.0:
-            continue
-        took = (6.0 * 3.0 * step * inertia / abs(rate)) ** (1.0 / 3.0)
-        late = 0.5 * took + (delay - 1.0) * period
-        found.append((rest, torque[at - 1] - rate * late, 0.5 * abs(rate) * (took + period)))
-    place, loose, error = np.array(found).reshape(-1, 3).T
-    return place, loose, error
-
-
-def encoder_step(counts: NDArray[np.int64]) -> int:
-    """Return the greatest common divisor of all changes of the position [counts]."""
-    return int(np.gcd.reduce(np.abs(np.diff(counts)))) or 1

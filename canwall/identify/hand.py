@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from canwall.config import Settings
 from canwall.cycle import modelled_delay
-from canwall.identify.fit import Estimate, UntellingDataError, torque_response
+from canwall.identify.estimates import Estimate, UntellingDataError
+from canwall.identify.pieces import torque_response
 
 Array = NDArray[np.float64]
 

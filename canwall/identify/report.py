@@ -3,20 +3,21 @@
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from canwall.config import Settings
-from canwall.figure_style import COLOURS, STYLE
-from canwall.identify.fit import Estimate, ServoFit
+from canwall.extras import is_installed
+from canwall.figure_style import COLOURS, DPI, PAGE_IN, STYLE
+from canwall.identify.estimates import Estimate, ServoFit
 from canwall.identify.hand import HandFit
 from canwall.identify.session import Identified, Measured
 from canwall.record import RecordError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Array = NDArray[np.float64]
 
@@ -126,9 +127,15 @@ def toml_fragment(found: Identified) -> str:
         f"inertia_kg_m2 = {servo.inertia.value:.4g}",
         f"viscous_nm_s_per_rad = {max(servo.viscous.value, 0.0):.3g}",
         f"coulomb_nm = {max(servo.coulomb.value, 0.0):.3g}",
-        "",
-        "[drive]",
     ]
+    if servo.shaft is not None:
+        rotor = servo.inertia.value / (1.0 + servo.shaft.ratio.value)
+        lines += [
+            f"shaft_hz = {servo.shaft.hz.value:.1f}",
+            f"shaft_damping_ratio = {max(servo.shaft.damping_ratio.value, 0.0):.3g}",
+            f"rotor_inertia_kg_m2 = {rotor:.3g}",
+        ]
+    lines += ["", "[drive]"]
     if lag_is_known(servo):
         lines.append(f"current_bandwidth_hz = {_bandwidth_hz(servo.lag.value):.0f}")
         delay = servo.delay.high
@@ -152,20 +159,24 @@ def lag_is_known(servo: ServoFit) -> bool:
 def write_report(found: Identified, settings: Settings, inertia: float | None = None) -> list[Path]:
     """Write identify.txt, .toml, .json and .png into the folder of the record; return the paths.
 
+    There is no picture without the packages of the extra `plot`.
+
     Raises RecordError if they cannot be written.
     """
     folder = found.result.folder.path
-    paths = [folder / f"identify.{ending}" for ending in ("txt", "json", "png")]
+    paths = [folder / f"identify.{ending}" for ending in ("txt", "json")]
     try:
         lines = report_lines(found, settings, inertia)
         paths[0].write_text("\n".join(lines) + "\n", encoding="utf-8")
-        text = json.dumps(_json_content(found), indent=2, ensure_ascii=False)
+        text = json.dumps(json_content(found), indent=2, ensure_ascii=False)
         paths[1].write_text(text + "\n", encoding="utf-8")
         if found.servo is None:
-            return paths[:2]
-        draw(found, paths[2])
+            return paths
         paths.append(folder / "identify.toml")
         paths[-1].write_text(toml_fragment(found), encoding="utf-8")
+        if is_installed("plot"):
+            paths.append(folder / "identify.png")
+            draw(found, paths[-1])
     except OSError as error:
         raise RecordError(f"{folder}: {error.strerror}") from None
     return paths
@@ -218,7 +229,8 @@ def _bandwidth_text(servo: ServoFit) -> str:
     return f"{_bandwidth_hz(servo.lag.value):.0f} Hz"
 
 
-def _json_content(found: Identified) -> dict[str, Any]:
+def json_content(found: Identified) -> dict[str, Any]:
+    """Return the content of identify.json."""
     source = found.hand if found.hand is not None else found.servo
     content: dict[str, Any] = {}
     parts = dict(vars(source))
@@ -241,31 +253,40 @@ def _json_content(found: Identified) -> dict[str, Any]:
 
 def draw(found: Identified, path: Path) -> None:
     """Draw measured and modelled motion, what is left, cogging and break-away torques."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
     servo, measured = _of_servo(found)
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(12, 7.5), layout="constrained", dpi=120)
+        figure = Figure(figsize=(PAGE_IN, 6.0), layout="constrained", dpi=DPI)
         (motion, left), (cogging, whole) = figure.subplots(2, 2)
         _draw_motion(motion, left, servo, measured)
         place, torque = servo.cogging
-        cogging.plot(place, torque * 1e3, color=COLOURS[1])
-        cogging.set(title="cogging over position", xlabel="rad", ylabel="mN·m")
+        cogging.plot(place, torque * 1e3, color=COLOURS[0])
+        cogging.set(title="cogging over position", xlabel="position [rad]", ylabel="torque [mN·m]")
         time = np.arange(len(measured.position)) * measured.period
-        whole.plot(time, measured.position, color=COLOURS[1], lw=0.6)
-        whole.set(title="the whole record", xlabel="s", ylabel="rad")
+        whole.plot(time, measured.position, color=COLOURS[0], lw=0.6)
+        whole.set(title="the whole record", xlabel="time [s]", ylabel="position [rad]")
         figure.savefig(path)
 
 
-def _draw_motion(motion: Axes, left: Axes, servo: ServoFit, measured: Measured) -> None:
+def _draw_motion(motion: "Axes", left: "Axes", servo: ServoFit, measured: Measured) -> None:
     time, position, model = servo.shown
     begin = time - time[0]
     # The mean speed hides what the torques do.
     mean = np.polyval(np.polyfit(begin, position, 1), begin)
-    motion.plot(begin * 1e3, (position - mean) * 1e3, ".", ms=3, color=COLOURS[1], label="measured")
-    motion.plot(begin * 1e3, (model - mean) * 1e3, lw=0.8, color=COLOURS[0], label="model")
-    motion.set(title="position without its mean speed", xlabel="ms", ylabel="mrad")
+    motion.plot(
+        begin * 1e3, (position - mean) * 1e3, ".", ms=3.5, color=COLOURS[4], label="measured"
+    )
+    motion.plot(begin * 1e3, (model - mean) * 1e3, lw=0.9, color="k", label="model")
+    motion.set(
+        title="position without its mean speed", xlabel="time [ms]", ylabel="position [mrad]"
+    )
     motion.legend()
-    left.plot(begin * 1e3, (position - model) / measured.step, ".", ms=3, color=COLOURS[1])
+    left.plot(begin * 1e3, (position - model) / measured.step, ".", ms=3, color=COLOURS[4])
     left.axhline(0.5, color="black", lw=0.8, ls="--")
     left.axhline(-0.5, color="black", lw=0.8, ls="--", label="half a step of the encoder")
-    left.set(title="measured minus model", xlabel="ms", ylabel="steps of the encoder")
-    left.legend()
+    left.set(
+        title="measured minus model", xlabel="time [ms]", ylabel="position [steps of the encoder]"
+    )
+    left.legend(loc="upper left", frameon=True, edgecolor="none")

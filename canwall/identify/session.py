@@ -9,16 +9,12 @@ from numpy.typing import NDArray
 
 from canwall.config import Settings
 from canwall.cycle import ExperimentError, WallAxis
+from canwall.identify.break_away import break_away
+from canwall.identify.estimates import Estimate, ServoFit, UntellingDataError
 from canwall.identify.excitation import Excitation, HandExcitation
-from canwall.identify.fit import (
-    Estimate,
-    ServoFit,
-    UntellingDataError,
-    break_away,
-    encoder_step,
-    fit_servo,
-)
+from canwall.identify.fit import fit_servo
 from canwall.identify.hand import HandFit, fit_hand
+from canwall.identify.pieces import encoder_step
 from canwall.run import RunResult, run
 
 Array = NDArray[np.float64]
@@ -74,15 +70,19 @@ class Identification:
         self._axis, self._excitation = axis, excitation
         self._position = 0.0
         self._rows: list[tuple[float, float, float, int]] = []
+        #: Periods since the last TPDO, and SYNCs left out so far.
+        self._periods, self._skipped = 1, int(axis.cycle["skipped_sync"][0])
 
     def excite(self) -> bool:
         """Set the torque of the next cycle; return False at the end."""
         axis = self._axis
         row = axis.row[0]
+        periods = 0
         if row["received"]:
             self._position = float(row["position_rad"])
+            periods, self._periods = self._periods, 0
         try:
-            torque = self._excitation.next(self._position)
+            torque = self._excitation.next(self._position, periods)
         except UntellingDataError as error:
             raise ExperimentError(axis, str(error)) from None
         nm_per_mille = float(axis.cycle["nm_per_mille"][0])
@@ -92,10 +92,26 @@ class Identification:
     def note(self) -> None:
         """Note position and torques of the last cycle."""
         row = self._axis.row[0]
+        left_out = int(self._axis.cycle["skipped_sync"][0]) - self._skipped
+        self._skipped += left_out
+        self._periods += 1 + left_out
+        if left_out and self._rows:
+            self._stand_still(left_out)
         position = float(row["position_rad"]) if row["received"] else np.nan
         self._rows.append(
             (position, float(row["torque_cmd"]), float(row["torque_actual"]), int(row["counts"]))
         )
+
+    def _stand_still(self, cycles: int) -> None:
+        """Insert SYNCs that the master left out: the torque that was in force stayed in force."""
+        position, torque, actual, counts = self._rows[-1]
+        held = torque
+        if self._axis.setup.synchronous and len(self._rows) > 1:
+            # The last torque has waited for the next SYNC.
+            held = self._rows[-2][1]
+            self._rows[-1] = (position, held, actual, counts)
+        self._rows += [(np.nan, held, actual, counts)] * (cycles - 1)
+        self._rows.append((np.nan, torque, actual, counts))
 
     def conclude(self) -> None:
         """Leave the fit to the time when the drive is disabled."""

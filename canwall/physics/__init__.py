@@ -7,7 +7,7 @@ drives or CAN.
 from canwall.physics.contact import Grasp, HandBody, advance_grasp
 from canwall.physics.motion import MAX_EVENTS, PLANT, advance, contact_end, make_plant, time_to_wall
 from canwall.physics.oscillator import acceleration, basis, flow, zoh, zoh_coefficients
-from canwall.physics.shaft import SHAFT, TwoMasses, advance_shaft, make_shaft
+from canwall.physics.shaft import SHAFT, TwoMasses, advance_shaft, make_shaft, shaft_spring
 from canwall.physics.smooth import Force
 from canwall.physics.wall import capped_stiffness, damping_of_ratio
 
@@ -30,6 +30,7 @@ __all__ = [
     "flow",
     "make_plant",
     "make_shaft",
+    "shaft_spring",
     "time_to_wall",
     "zoh",
     "zoh_coefficients",

@@ -56,6 +56,24 @@ class TwoMasses(NamedTuple):
     load_v: float
 
 
+def shaft_spring(
+    inertia: float, rotor: float, resonance_hz: float, damping_ratio: float
+) -> tuple[float, float]:
+    """Return stiffness and damping of the shaft between two masses that resonate.
+
+    They resonate at √(k/μ), where μ is their reduced mass.
+
+    Args:
+        inertia: Inertia of both masses together.
+        rotor: That of one of them.
+        resonance_hz: Resonance of one against the other [Hz].
+        damping_ratio: Its damping ratio.
+    """
+    reduced = rotor * (inertia - rotor) / inertia
+    resonance = 2.0 * math.pi * resonance_hz
+    return resonance**2 * reduced, 2.0 * damping_ratio * resonance * reduced
+
+
 def make_shaft(
     rotor: dict[str, float],
     load_mass: float,

@@ -7,8 +7,9 @@ The cycle writes into a ring in shared memory and never waits for a disk. A sepa
 from canwall.record.columns import ROW, TIMING_COLUMNS, Phase, column_table
 from canwall.record.folder import RecordError, RunFolder, numbers, read_signals
 from canwall.record.mailbox import Mailbox
-from canwall.record.recorder import Recorder, start_recorders
+from canwall.record.recorder import Recorder, Stream, start_recorders
 from canwall.record.ring import FRAME, Ring
+from canwall.record.target import parse_target
 
 __all__ = [
     "FRAME",
@@ -20,8 +21,10 @@ __all__ = [
     "Recorder",
     "Ring",
     "RunFolder",
+    "Stream",
     "column_table",
     "numbers",
+    "parse_target",
     "read_signals",
     "start_recorders",
 ]

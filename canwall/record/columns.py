@@ -85,6 +85,9 @@ COLUMNS = (
     Column("latency_s", "f8", "s", "time from reception of the TPDO to the RPDO", by_clock=True),
 )
 
+#: Unit of each column, empty if there is none.
+UNITS = {column.name: column.unit for column in COLUMNS}
+
 #: Row of one cycle, in the cycle and in the ring.
 ROW = np.dtype([(column.name, column.dtype) for column in COLUMNS], align=True)
 
@@ -104,7 +107,9 @@ def column_table() -> str:
 def schema(laws: Sequence[str]) -> "pa.Schema":
     """Return the schema of signals.parquet for a run with these laws.
 
-    The metadata of a field are `unit` and `description`; those of the schema are `laws`, as JSON.
+    The metadata of a field are `unit` and `description`; those of the schema are, as JSON, `laws`,
+    `units` by column, and the same for `pandas.read_parquet`, which makes them the attributes
+    (`attrs`) of its DataFrame.
     """
     import pyarrow as pa
 
@@ -118,7 +123,8 @@ def schema(laws: Sequence[str]) -> "pa.Schema":
         )
         for column in COLUMNS
     ]
-    return pa.schema(fields, metadata={"laws": json.dumps(list(laws))})
+    metadata = {"laws": list(laws), "units": UNITS, "PANDAS_ATTRS": {"units": UNITS}}
+    return pa.schema(fields, {key: json.dumps(value) for key, value in metadata.items()})
 
 
 def record_batch(rows: NDArray[np.void], laws: Sequence[str]) -> "pa.RecordBatch":

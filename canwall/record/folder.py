@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from canwall.errors import ConfigError, RunFailedError
 from canwall.record.columns import schema
-from canwall.record.mailbox import MailboxAddress
+from canwall.record.shared_memory import LiveAddresses, MemoryAddress
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -30,6 +30,7 @@ _STRIKE = {
     "stiffness": float,
     "chatter": bool,
     "chatter_frequency_hz": float,
+    "peak_penetration_rad": float,
 }
 
 
@@ -78,22 +79,30 @@ def stream_of(signals: Path) -> Path:
     return signals.with_suffix(".arrows")
 
 
-def read_signals(path: Path, columns: Collection[str] = ("j",)) -> "pa.Table":
+def read_signals(
+    path: Path, columns: Collection[str] = ("j",), *, only: bool = False
+) -> "pa.Table":
     """Read signals.parquet as a table, or the stream of a run that was cut off.
 
     The table has all columns of the record, which another version may have written: some may be
     missing and others added. `columns` are those that the caller requires.
+
+    Args:
+        path: The file.
+        columns: Names of the columns that the caller requires.
+        only: Read no others.
 
     Raises:
         ConfigError: If the file is missing, not readable, or lacks one of `columns`.
     """
     import pyarrow as pa
 
+    wanted = list(columns) if only else None
     try:
         try:
-            table = _read_stream(stream_of(path))
+            table = _read_stream(stream_of(path), wanted)
         except FileNotFoundError:
-            table = _read_parquet(path)
+            table = _read_parquet(path, wanted)
         table.validate(full=True)
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; give the folder of a run") from None
@@ -124,14 +133,14 @@ def numbers(signals: "pa.Table", name: str) -> NDArray[Any]:
     return np.concatenate(chunks) if chunks else np.empty(0)
 
 
-def _read_parquet(path: Path) -> "pa.Table":
+def _read_parquet(path: Path, columns: list[str] | None) -> "pa.Table":
     import pyarrow.parquet as pq
 
     with pq.ParquetFile(path, page_checksum_verification=True) as file:
-        return file.read()
+        return file.read(columns)
 
 
-def _read_stream(path: Path) -> "pa.Table":
+def _read_stream(path: Path, columns: list[str] | None) -> "pa.Table":
     """Return the batches of a stream up to the first incomplete one."""
     import pyarrow as pa
 
@@ -139,7 +148,12 @@ def _read_stream(path: Path) -> "pa.Table":
         batches = []
         with contextlib.suppress(OSError, pa.ArrowException):
             batches.extend(stream)
-        return pa.Table.from_batches(batches, stream.schema)
+        table = pa.Table.from_batches(batches, stream.schema)
+        return (
+            table
+            if columns is None
+            else table.select([n for n in columns if n in table.schema.names])
+        )
 
 
 @dataclass(frozen=True)
@@ -191,7 +205,7 @@ class RunFolder:
     def _files(self, bus_log: str) -> list[Path]:
         signals, log = self.signals, self.path / bus_log
         known = [signals, stream_of(signals), self.summary, self.picture, self.live, self.trip]
-        return [*known, self.config, log]
+        return [*known, self.events, self.config, log]
 
     @property
     def is_being_written(self) -> bool:
@@ -237,8 +251,13 @@ class RunFolder:
 
     @property
     def live(self) -> Path:
-        """Path of a file that exists during the run and holds the address for changes."""
+        """Path of a file that exists during the run, with the addresses of its shared memory."""
         return self.path / "live.json"
+
+    @property
+    def events(self) -> Path:
+        """Path of what other processes asked of the run, and of their marks (JSON lines)."""
+        return self.path / "events.jsonl"
 
     @property
     def trip(self) -> Path:
@@ -262,21 +281,44 @@ class RunFolder:
         with whole_file(self.trip) as file:
             pa_csv.write_csv(rows, file)
 
-    def write_live(self, address: MailboxAddress) -> None:
+    def write_live(self, addresses: LiveAddresses) -> None:
         """Write live.json. Raises RecordError if it cannot be written."""
+        content = {name: address._asdict() for name, address in addresses._asdict().items()}
         with whole_file(self.live) as file:
-            file.write(json.dumps(address._asdict()).encode())
+            file.write(json.dumps(content, indent=1).encode() + b"\n")
 
-    def read_live(self) -> MailboxAddress:
+    def read_live(self) -> LiveAddresses:
         """Read live.json. Raises OSError or ValueError if there is none that can be used."""
         try:
             content = json.loads(self.live.read_text(encoding="utf-8"))
         except RecursionError:
             content = None
-        kinds = MailboxAddress.__annotations__
-        if not isinstance(content, dict) or {k: type(v) for k, v in content.items()} != kinds:
-            raise ValueError("not the address of a mailbox")
-        return MailboxAddress(**content)
+        if not isinstance(content, dict) or set(content) != set(LiveAddresses._fields):
+            raise ValueError("not the addresses of a run")
+        return LiveAddresses(**{name: _address(value) for name, value in content.items()})
+
+    def write_event(self, event: dict[str, Any]) -> None:
+        """Append a line to events.jsonl. Raises OSError."""
+        with self.events.open("ab") as file:
+            file.write(json.dumps(event, ensure_ascii=False).encode() + b"\n")
+
+    def read_events(self) -> list[dict[str, Any]]:
+        """Read events.jsonl: requests that were taken, marks and what else ended the wall.
+
+        A line that a failure has cut off is left out; a run without requests has none.
+        """
+        try:
+            lines = self.events.read_bytes().splitlines()
+        except FileNotFoundError:
+            return []
+        except OSError as error:
+            raise ConfigError(f"{self.events}: {reason(error)}") from None
+        events = []
+        for line in lines:
+            with contextlib.suppress(ValueError, RecursionError):
+                if isinstance(event := json.loads(line), dict):
+                    events.append(event)
+        return events
 
     def read_summary(self) -> dict[str, Any]:
         """Read summary.json. Raises ConfigError if it is missing or not a summary."""
@@ -288,6 +330,13 @@ class RunFolder:
         if not isinstance(strikes, list) or not all(map(_is_strike, strikes)):
             raise ConfigError(f"{self.summary}: not a summary of a run: lacks strikes")
         return content
+
+
+def _address(value: object) -> MemoryAddress:
+    kinds = MemoryAddress.__annotations__
+    if not isinstance(value, dict) or {k: type(v) for k, v in value.items()} != kinds:
+        raise ValueError("not the address of a block of memory")
+    return MemoryAddress(**value)
 
 
 def _is_strike(entry: object) -> bool:

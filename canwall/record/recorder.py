@@ -13,13 +13,18 @@ from typing import Any
 
 from canwall.record.folder import RecordError
 from canwall.record.ring import Ring
+from canwall.record.target import Target
 
-#: Time limit for the writer to complete its files after the run, or to draw [s].
-_TIMEOUT_S = 60.0
+#: Time limit for the writer to complete its files after the run, or to draw [s], and what it has
+#: more to draw each row of a long run [s].
+_TIMEOUT_S, _DRAWING_S = 60.0, 1e-4
 
 
 #: Interval at which it is asked whether to wait any longer [s].
 _LOOK_S = 0.05
+
+#: Time limit for a stream to send what is left at the end of a run [s].
+_STREAM_REST_S = 2.0
 
 
 class Recorder:
@@ -96,7 +101,8 @@ class Recorder:
         given_up: Asked meanwhile; True ends the drawing.
         """
         self._tell(draw=True)
-        error = self._answer(given_up)
+        rows = int(self.ring.header["row_head"][0])
+        error = self._answer(given_up, _TIMEOUT_S + _DRAWING_S * rows)
         return [f"{self.folder}: the picture is missing: {error}"] if error else []
 
     def _tell(self, **order: Any) -> None:
@@ -104,9 +110,11 @@ class Recorder:
         with contextlib.suppress(BrokenPipeError):  # `_listen` notices a writer that has died
             self._writer.stdin.write(json.dumps(order).encode() + b"\n")
 
-    def _answer(self, given_up: Callable[[], bool] = lambda: False) -> str:
+    def _answer(
+        self, given_up: Callable[[], bool] = lambda: False, timeout_s: float | None = None
+    ) -> str:
         """Return the writer's error message on an order, empty if all went well."""
-        deadline = time.monotonic() + _TIMEOUT_S
+        deadline = time.monotonic() + (_TIMEOUT_S if timeout_s is None else timeout_s)
         while not self._answers:
             if not self._says.poll(_LOOK_S * 1e3):
                 if given_up():
@@ -134,6 +142,47 @@ class Recorder:
         if not part:
             self._failure = self._failure or "the writer of the record has died"
         return bool(part)
+
+
+class Stream:
+    """Rows of a run that are sent to a plotting program as they come; a context manager.
+
+    A process of its own reads along behind the loop and takes nothing out of the ring: neither a
+    receiver that is slow or absent nor the end of that process disturbs the run.
+    """
+
+    def __init__(self, ring: Ring, target: Target, name: str, laws: Sequence[str]) -> None:
+        """Start the process. Raises RecordError.
+
+        Args:
+            ring: Ring of the run, which has to outlast the stream.
+            target: Host and port to which it sends, see `parse_target`.
+            name: Name of the group of signals.
+            laws: Names of the laws of the run.
+        """
+        what = json.dumps({"target": target, "name": name, "laws": list(laws)})
+        try:
+            self._sender = subprocess.Popen(
+                [sys.executable, "-P", "-m", "canwall.record.stream", str(ring.descriptor), what],
+                stdin=subprocess.PIPE,
+                bufsize=0,
+                pass_fds=[ring.descriptor],
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise RecordError(f"the stream does not start: {error}") from None
+
+    def __enter__(self) -> "Stream":
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        assert self._sender.stdin is not None
+        self._sender.stdin.close()  # it sends the rest and ends
+        try:
+            self._sender.wait(_STREAM_REST_S)
+        except subprocess.TimeoutExpired:
+            self._sender.kill()
+            self._sender.wait()
 
 
 @contextlib.contextmanager

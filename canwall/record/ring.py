@@ -5,7 +5,6 @@ counter: the head counts the items put in (`append`), the tail the items taken o
 reset.
 """
 
-import fcntl
 import mmap
 import os
 
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from canwall.compiled import data_to_number, number_to_data
 from canwall.record.columns import ROW
 from canwall.record.memory_order import fence
+from canwall.record.shared_memory import MemoryAddress, address_of, create_memory, open_memory
 
 #: Bits of a FRAME's flags.
 RECEIVED, REMOTE, ERROR, EXTENDED = 1, 2, 4, 8
@@ -49,13 +49,15 @@ HEADER = np.dtype(
 ROWS = 1 << 14
 FRAMES = 1 << 16
 
+_KIND = "record"
+
 
 class Ring:
     """Both rings in one block of shared memory, shared with another process by descriptor."""
 
-    def __init__(self, descriptor: int) -> None:
+    def __init__(self, descriptor: int, access: int = mmap.ACCESS_WRITE) -> None:
         self.descriptor = descriptor
-        self._memory = mmap.mmap(descriptor, self.size())
+        self._memory = mmap.mmap(descriptor, self.size(), access=access)
         self.header = np.frombuffer(self._memory, HEADER, 1)
         offset = self._offsets()
         self.rows = np.frombuffer(self._memory, ROW, ROWS, offset[0])
@@ -63,13 +65,18 @@ class Ring:
 
     @classmethod
     def create(cls) -> "Ring":
-        """Create an empty ring."""
-        memory = os.memfd_create("canwall-record")
-        # The writer has standard streams in place of whatever was closed here.
-        descriptor = fcntl.fcntl(memory, fcntl.F_DUPFD_CLOEXEC, 3)
-        os.close(memory)
-        os.ftruncate(descriptor, cls.size())
-        return cls(descriptor)
+        """Create an empty ring. Raises OSError."""
+        return cls(create_memory(_KIND, cls.size()))
+
+    @classmethod
+    def open(cls, address: MemoryAddress) -> "Ring":
+        """Open the ring of another process to read in it. Raises OSError if it no longer exists."""
+        return cls(open_memory(_KIND, address, cls.size()), mmap.ACCESS_READ)
+
+    @property
+    def address(self) -> MemoryAddress:
+        """Address by which other processes on this machine open it while this process lives."""
+        return address_of(self.descriptor)
 
     @staticmethod
     def _offsets() -> tuple[int, int, int]:
@@ -120,6 +127,25 @@ class Ring:
     def take_frames(self) -> NDArray[np.void]:
         """Take out all frames: a copy of shape (n,), dtype FRAME; called by the consumer."""
         return self._take(self.frames, "frame_head", "frame_tail")
+
+    def rows_since(self, start: int) -> tuple[int, NDArray[np.void]]:
+        """Copy the rows from a number on, for a reader besides the consumer; take none out.
+
+        Args:
+            start: Number of the first row that is wanted, from 0.
+
+        Returns:
+            Number of the row after the last, and the rows, shape (n,), dtype ROW. Those that the
+            producer has overwritten by then are left out.
+        """
+        stop = int(self.header["row_head"][0])
+        first = max(start, stop - ROWS)
+        fence()
+        rows = self.rows[np.arange(first, stop) % ROWS]
+        fence()
+        # The row after the head may be in the making, in the place of the one ROWS before it.
+        whole_from = int(self.header["row_head"][0]) - ROWS + 1
+        return stop, rows[max(0, whole_from - first) :]
 
     def _take(self, ring: NDArray[np.void], head: str, tail: str) -> NDArray[np.void]:
         start, stop = int(self.header[tail][0]), int(self.header[head][0])

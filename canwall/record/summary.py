@@ -105,10 +105,11 @@ def _strike(
     running = work[cycles] - work[start]
     energy_tolerance = units.rad_per_count * float(np.abs(force[cycles]).max(initial=0.0))
     if referent is None or referent_felt is None:
-        ripple = _ripple_of_contact(strike, force, settings)
+        ripple, judged = _ripple_of_contact(strike, force, settings)
     else:
         rest, first, last = metrics.settled_window(referent[cycles], tolerance, period)
         windows = (rest + start, first + start, last + start)
+        judged = slice(*windows[1:])
         ripple = metrics.Ripple(
             _felt(force, *windows, settings), _felt(referent_felt, *windows, settings), _SOURCE
         )
@@ -122,6 +123,8 @@ def _strike(
         ripple,
     )
     amplitude, frequency = metrics.limit_cycle(inside, period) if verdict.chatters else (0.0, 0.0)
+    if verdict.by == "ripple":  # it may be felt within one count
+        _, frequency = metrics.limit_cycle(force[judged], period)
     around = slice(max(start - SPAN - 1, 0), cycles.stop + SPAN)
     return {
         "start_s": start * period,
@@ -172,13 +175,14 @@ def _felt(force: Array, start: int, first: int, last: int, settings: Settings) -
 
 def _ripple_of_contact(
     strike: metrics.StrikeContacts, force: Array, settings: Settings
-) -> metrics.Ripple:
-    """Return the ripple of the longest contact, if it is long enough to have settled."""
+) -> tuple[metrics.Ripple, slice]:
+    """Return the ripple of the longest contact, if it is long enough to have settled, and where."""
     longest = max(strike.contacts, key=lambda contact: contact.stop - contact.start)
-    if (longest.stop - longest.start) * settings.bus.cycle_s < _LONG_CONTACT_S:
-        return metrics.Ripple()
     first, last = metrics.judged_part(longest.start, longest.stop)
-    return metrics.Ripple(_felt(force, longest.start, first, last, settings), 0.0, _SOURCE)
+    if (longest.stop - longest.start) * settings.bus.cycle_s < _LONG_CONTACT_S:
+        return metrics.Ripple(), slice(first, last)
+    felt = _felt(force, longest.start, first, last, settings)
+    return metrics.Ripple(felt, 0.0, _SOURCE), slice(first, last)
 
 
 def _known(value: float) -> float | None:

@@ -3,7 +3,7 @@
 It takes orders from standard input (sent by `recorder.Recorder`) and answers on standard output,
 one line of JSON each; if the record cannot go on, it says so at once. When the master closes its
 end of the pipe, or dies, the writer completes the files and ends. It also draws the picture, since
-it can load the plotting library while the master sets up the drive.
+it can load the plotting library, and what a first picture needs, while the run lasts.
 """
 
 import contextlib
@@ -13,6 +13,7 @@ import os
 import select
 import sqlite3
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import IO, Any
@@ -24,6 +25,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from canwall.errors import ConfigError
+from canwall.extras import is_installed
 from canwall.record.columns import ROW, record_batch, schema
 from canwall.record.folder import (
     RecordError,
@@ -34,8 +36,10 @@ from canwall.record.folder import (
     synchronise,
     whole_file,
 )
-from canwall.record.pictures import plot_run
 from canwall.record.ring import Ring, to_message
+
+if is_installed("plot"):
+    pass  # now, while the master has other things to do
 
 #: Rows per row group; the last one may have fewer.
 _ROW_GROUP = 8192
@@ -167,8 +171,19 @@ def _record(ring: Ring, orders: IO[bytes], order: dict[str, Any]) -> None:
             ring.take_rows()
 
 
+def _prepare_to_draw(ended: threading.Event) -> None:
+    """Load what draws, unless there is nothing to draw any more."""
+    if is_installed("plot") and not ended.is_set():
+        from canwall.record.pictures import warm_up
+
+        with contextlib.suppress(Exception):  # the picture itself will tell
+            warm_up()
+
+
 def _draw(folder: Path) -> str:
     """Draw the run's picture; return an error message or an empty text."""
+    from canwall.record.pictures import plot_run
+
     try:
         plot_run(RunFolder(folder))
     except (OSError, ConfigError, RecordError) as failure:
@@ -184,6 +199,9 @@ def _say(**what: str) -> None:
 def main() -> None:
     """Execute orders to record, to complete the record, and to draw it, one line of JSON each."""
     ring = Ring(int(sys.argv[1]))
+    ended = threading.Event()
+    loading = threading.Thread(target=_prepare_to_draw, args=(ended,))
+    loading.start()
     # Unbuffered, so that select sees a waiting line.
     with open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as orders:
         if begin := orders.readline():
@@ -192,7 +210,9 @@ def main() -> None:
             if orders.readline():
                 _say(done="")
             while orders.readline():
+                loading.join()
                 _say(done=_draw(Path(order["folder"])))
+    ended.set()
     gc.freeze()  # the master waits for the exit: spare it a collection of all imported modules
 
 

@@ -13,7 +13,7 @@ from canwall.run.assembly import (
     render,
     restoring_drives,
 )
-from canwall.run.buses import make_simulated_drive, on_the_bus, open_bus, serve_drive
+from canwall.run.buses import make_simulated_drive, on_the_bus, open_bus
 from canwall.run.recorded import RunRecord, read_run
 from canwall.run.result import RunResult
 from canwall.run.running import run, run_together
@@ -35,6 +35,5 @@ __all__ = [
     "restoring_drives",
     "run",
     "run_together",
-    "serve_drive",
     "stop_on_signals",
 ]

@@ -65,9 +65,7 @@ def make_axis(
             _tell(error, _restored(node))
         raise
     period = settings.bus.cycle_s
-    changes = [
-        WallStage(round(at_s / period), wall, limits) for at_s, wall, limits in settings.stages[1:]
-    ]
+    changes = [WallStage(round(stage[0] / period), *stage[1:]) for stage in settings.stages[1:]]
     return WallAxis(node, setup, settings, laws, ring, changes)
 
 

@@ -7,7 +7,8 @@ from functools import partial
 import can
 
 from canwall import simdrive
-from canwall.bus import reason, socket_pair
+from canwall.bus import open_bus as opened
+from canwall.bus import socket_pair
 from canwall.compiled import compile_beside
 from canwall.config import ConfigError, Settings
 from canwall.drive import Link, refuse_second_master
@@ -23,16 +24,7 @@ def open_bus(settings: Settings) -> can.BusABC:
         ConfigError: If the bus does not exist.
     """
     bus = settings.bus
-    try:
-        return can.Bus(interface=bus.interface, channel=bus.channel, bitrate=bus.bitrate)
-    except (can.CanError, OSError, ValueError, ImportError, TypeError) as error:
-        if isinstance(error, OSError) and error.errno is not None:
-            why = reason(error.errno, bus.channel)
-        else:
-            why = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ConfigError(
-            f"bus.interface = {bus.interface!r}, bus.channel = {bus.channel!r}: {why}"
-        ) from None
+    return opened(bus.interface, bus.channel, bus.bitrate)
 
 
 def make_simulated_drive(
@@ -54,29 +46,6 @@ def make_simulated_drive(
     return simdrive.make_drive(
         settings.drive, settings.simulation, bus.cycle_s, bus.bitrate, report
     )
-
-
-def serve_drive(
-    settings: Settings,
-    stop: Callable[[], bool],
-    joined: Callable[[], None],
-    report: Callable[[str], None] = lambda line: None,
-) -> None:
-    """Run a simulated drive on its bus until stopped (`canwall drive`).
-
-    Args:
-        settings: Configuration of the drive.
-        stop: Called every millisecond or more often; True ends the drive.
-        joined: Called once the drive receives from the bus.
-        report: Called with a line when a fault begins or ends, or the bus goes or comes back.
-    """
-    drive = make_simulated_drive(settings, report)
-    with open_bus(settings) as bus:
-        # A real controller generates error frames itself; given one, it sends it as data.
-        virtual = settings.bus.interface == "unixcan" or settings.bus.channel.startswith("vcan")
-        runner = simdrive.BusRunner(drive, bus, error_frames=virtual, report=report)
-        joined()
-        runner.run(stop)
 
 
 @contextmanager

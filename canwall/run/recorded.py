@@ -38,7 +38,9 @@ class RunRecord:
     remark: str
 
 
-def read_run(folder: RunFolder, columns: Collection[str] = ("j",)) -> RunRecord:
+def read_run(
+    folder: RunFolder, columns: Collection[str] = ("j",), *, complete: bool = True
+) -> RunRecord:
     """Read a run; complete its folder first if it was cut off.
 
     After a loss of power, or of master and writer, a folder has the rows, the frames and the
@@ -48,6 +50,7 @@ def read_run(folder: RunFolder, columns: Collection[str] = ("j",)) -> RunRecord:
     Args:
         folder: Folder of the run.
         columns: Columns that the caller requires, see `read_signals`.
+        complete: Write what a folder lacks; otherwise it is left alone.
 
     Raises:
         ConfigError: If the folder holds no record, rows that are damaged, or something else as
@@ -67,8 +70,9 @@ def read_run(folder: RunFolder, columns: Collection[str] = ("j",)) -> RunRecord:
         return RunRecord(
             signals, summary, f"{folder.path}: the run is in progress; this is what there is so far"
         )
-    folder.write_trip(signals, summary["trip_cycle"])
-    folder.write_summary(summary)
+    if complete:
+        folder.write_trip(signals, summary["trip_cycle"])
+        folder.write_summary(summary)
     return RunRecord(signals, summary, _remark(folder, summary))
 
 

@@ -154,7 +154,7 @@ def _guard_summary(axis: WallAxis) -> dict[str, Any]:
     guard, period = axis.cycle["guard"][0, 0], axis.settings.bus.cycle_s
     first = int(guard["first_alarm"])
     return {
-        "action": axis.settings.guard.action,
+        "action": axis.guard.action,
         "alarms": int(guard["alarms"]),
         "first_alarm_s": None if first < 0 else first * period,
         "least_force": float(guard["lowest"]),

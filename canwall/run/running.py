@@ -4,13 +4,14 @@ Everything that can fail on bad input comes first, then the bus, then the drive.
 """
 
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 from canwall.config import ConfigError, Settings
 from canwall.cycle import Exchange, Experiment, Outcome, WallAxis, WallGivenUpError, run_laws
 from canwall.errors import InputError, RunFailedError
-from canwall.record import Recorder, RunFolder, start_recorders
+from canwall.extras import how_to_install, is_installed
+from canwall.record import Recorder, RunFolder, Stream, parse_target, start_recorders
 from canwall.run.assembly import (
     drive_dictionary,
     make_axis,
@@ -70,6 +71,8 @@ def run_together(
     progress: Callable[[float, float | None], None] = lambda now_s, end_s: None,
     stopped: Callable[[], bool] = lambda: False,
     experiment: Callable[[WallAxis], Experiment] | None = None,
+    stream: str | None = None,
+    live: Callable[[Path], None] = lambda folder: None,
 ) -> list[RunResult]:
     """Call `run` for several drives on one bus, each with its wall, on one SYNC.
 
@@ -78,22 +81,35 @@ def run_together(
 
     Signals are held from the first cycle on; a second one gives up the picture. A failure of the
     program itself is in the outcome, for the caller to raise.
+
+    With `stream`, udp://HOST:PORT, every row is also sent there while the walls are rendered
+    (`canwall.record.stream`).
+
+    `live` is called with the folder of the run, or that of the drives' folders, once other
+    processes can attach to it.
     """
     _check_together(many)
+    target = None if stream is None else parse_target(stream)
     laws = [run_laws(settings) for settings in many]
     dictionaries = [drive_dictionary(settings) for settings in many]
     first, outcome = many[0], Outcome()
-    with stop_on_signals(held=False) as stop:
+    with stop_on_signals(held=False) as stop, ExitStack() as streams:
         try:
             with on_the_bus(*many) as link:
                 # One log of the bus for all of them.
                 log = first.run.bus_log if len(many) == 1 else f"../{first.run.bus_log}"
                 folders = _run_folders(many, output, log)
                 notes: list[list[str]] = []
-                for folder, known, recorder in zip(folders, laws, recorders, strict=True):
+                for settings, folder, known, recorder in zip(
+                    many, folders, laws, recorders, strict=True
+                ):
                     bus_log = log if recorder is recorders[0] else ""
                     names = [law.name for law in known]
                     recorder.begin(folder.path, bus_log, first.bus.channel, names)
+                    if target is not None:
+                        streams.enter_context(
+                            Stream(recorder.ring, target, f"node{settings.drive.node_id}", names)
+                        )
                 try:
                     link.log = recorders[0].ring.log_frame
                     report("setting up the drive" if len(many) == 1 else "setting up the drives")
@@ -106,8 +122,12 @@ def run_together(
                         monitor = make_monitor(link, axes)
                         experiments = [experiment(axis) for axis in axes] if experiment else []
                         report("measuring" if experiments else "rendering")
-                        with closing(exchange), open_to_changes(axes, folders):
-                            stop.hold()
+                        with (
+                            closing(exchange),
+                            open_to_changes(axes, folders, exchange, outcome, stop.request),
+                        ):
+                            stop.hold(exchange.attend)
+                            live(folders[0].path if len(many) == 1 else folders[0].path.parent)
                             _render(
                                 exchange,
                                 lambda: _recorded(recorders) and (stop() or stopped()),
@@ -131,6 +151,9 @@ def run_together(
             if (told := _told(outcome, error)) is error:
                 raise
             raise told from error
+        if not is_installed("plot"):
+            results[0].remarks.append(f"no picture: {how_to_install('plot')}, then canwall plot")
+            return results
         report("drawing")
         enough = 1 if outcome.interrupted else 0
         for recorder, result in zip(recorders, results, strict=True):

@@ -9,7 +9,7 @@ from canwall.config import Simulation
 from canwall.config.drive import MILLI_NM
 from canwall.simdrive.communication.dictionary import Dictionary
 from canwall.simdrive.communication.memory import UNCONFIGURED, Memory
-from canwall.simdrive.drive import DEFAULT_BITRATE, SimulatedDrive
+from canwall.simdrive.drive import DEFAULT_BITRATE, ServoDrive
 from canwall.simdrive.faults import FaultyDrive, FaultyEncoder, planned
 from canwall.simdrive.mechanics.motion import ServoMotion
 from canwall.simdrive.profile.hardware import Hardware
@@ -53,7 +53,7 @@ def make_drive(
     counts, gear_ratio = _encoder(dictionary, simulation)
     encoder = FaultyEncoder(ServoMotion(simulation, sync_period_s, counts))
     hardware = _hardware(simulation, counts / (2.0 * math.pi), gear_ratio, _rated_unit_nm(drive))
-    simulated = SimulatedDrive(
+    simulated = ServoDrive(
         dictionary,
         node_id,
         encoder,

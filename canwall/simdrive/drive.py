@@ -43,7 +43,7 @@ _SYNC_GONE_S = 0.1
 _LONGEST_TICK_S = 0.01
 
 
-class SimulatedDrive:
+class ServoDrive:
     """A CiA 402 servo drive in its torque modes: frames in, frames out.
 
     No threads and no clock: SYNC moves the physics by one period, ``tick`` the protocol timers.
@@ -184,6 +184,21 @@ class SimulatedDrive:
     def actuator(self) -> Actuator:
         """Path of the demanded torque to the motion."""
         return self._actuator
+
+    @property
+    def dictionary(self) -> Dictionary:
+        """Its objects, with their present values."""
+        return self._dictionary
+
+    @property
+    def nmt_state(self) -> NmtState:
+        """State of the node (CiA 301)."""
+        return self._nmt.state
+
+    @property
+    def torque_nm(self) -> float:
+        """Torque that acts on the motor now, at the shaft, in N·m; 0 without the power stage."""
+        return 0.0 if self._pds.motor_free else self._actuator.torque_nm(self._pds.torque_nm)
 
     @property
     def emcy(self) -> EmergencyProducer:

@@ -1,11 +1,31 @@
 """Order in which a person meets stiffer and softer walls."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 from canwall.errors import InputError
-from canwall.study.session import Session, Verdict
+from canwall.study.session import Session
+
+
+class Judged(Protocol):
+    """A wall, and what a person said of it."""
+
+    @property
+    def law(self) -> str:
+        """Law of the wall."""
+        ...
+
+    @property
+    def stiffness_nm_per_rad(self) -> float:
+        """Stiffness of the wall [N·m/rad]."""
+        ...
+
+    @property
+    def free_of_chatter(self) -> bool:
+        """True if the person said so."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -39,21 +59,36 @@ class Staircase:
         if not self.finest > 1.0:
             raise InputError(f"--finest {self.finest:g}: has to be a factor above 1")
 
-    def climb(self, is_free: Callable[[float], bool]) -> None:
-        """Present one wall after another; `is_free` takes a stiffness and tells if it is free."""
+    def walls(self) -> Generator[float, bool, None]:
+        """Yield the stiffness of one wall after another; each is sent if it was free of chatter."""
         stiffness, factor = self.start, 2.0
-        free = is_free(stiffness)
+        free = yield stiffness
         floor = stiffness / 64.0
         while stiffness < self.ceiling if free else stiffness >= floor:
             before = free
             stiffness = min(stiffness * factor, self.ceiling) if free else stiffness / factor
-            free = is_free(stiffness)
+            free = yield stiffness
             if free:
                 floor = stiffness / 64.0
             if free != before:
                 if factor <= self.finest:
                     return
                 factor = math.sqrt(factor)
+
+    def climb(self, is_free: Callable[[float], bool]) -> None:
+        """Present one wall after another; `is_free` takes a stiffness and tells if it is free."""
+        walls = self.walls()
+        stiffness: float | None = next(walls)
+        while stiffness is not None:
+            stiffness = next_wall(walls, is_free(stiffness))
+
+
+def next_wall(walls: Generator[float, bool, None], free: bool) -> float | None:
+    """Send if a wall was free of chatter; return the stiffness of the next, None at the end."""
+    try:
+        return walls.send(free)
+    except StopIteration:
+        return None
 
 
 def run_staircases(session: Session, staircase: Staircase) -> None:
@@ -79,7 +114,7 @@ def run_alternating(session: Session, stiffnesses: Sequence[float]) -> None:
             return
 
 
-def stiffness_limits(verdicts: Sequence[Verdict]) -> dict[str, tuple[float, float]]:
+def stiffness_limits(verdicts: Sequence[Judged]) -> dict[str, tuple[float, float]]:
     """Return the stiffest wall free of chatter and the softest that chatters, for each law.
 
     In N·m/rad; 0 and infinity if there is none. If the answers contradict each other, the first

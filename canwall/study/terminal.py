@@ -4,6 +4,7 @@ import os
 import select
 import time
 from collections.abc import Iterable
+from typing import TextIO
 
 #: Interval at which the keyboard is polled while a wall is rendered [s].
 _POLL_INTERVAL_S = 0.02
@@ -16,16 +17,17 @@ class SessionEndedError(Exception):
 class Terminal:
     """Prompts and answers, line by line; a line can also stop a wall while it is rendered."""
 
-    def __init__(self, source: int = 0) -> None:
-        """Read from the file descriptor `source`, by default standard input."""
+    def __init__(self, source: int = 0, words: TextIO | None = None) -> None:
+        """Read from the descriptor `source`, print to `words`; by default the standard ones."""
         self._source = source
+        self._words = words
         self._buffer = b""
         self._polled_s = 0.0
         self._at_end = False
 
     def say(self, text: str) -> None:
         """Print a line."""
-        print(text, flush=True)
+        print(text, file=self._words, flush=True)
 
     def ask(self, question: str, answers: Iterable[str]) -> str:
         """Repeat the question until it gets one of the answers.
@@ -34,7 +36,7 @@ class Terminal:
         """
         known = tuple(answers)
         while True:
-            print(f"{question} ", end="", flush=True)
+            print(f"{question} ", end="", file=self._words, flush=True)
             line = self._read_line()
             if line is None or line == "q":
                 raise SessionEndedError

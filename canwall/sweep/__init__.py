@@ -1,6 +1,6 @@
 """Stiffness sweeps: strikes in memory or through frames, judged for chatter, over any axes."""
 
-from canwall.sweep.dataset import assemble_dataset, read_sweep, write_sweep
+from canwall.sweep.dataset import assemble_dataset, plan_of, read_sweep, write_sweep
 from canwall.sweep.execution import sweep
 from canwall.sweep.law_tables import (
     LAW_TABLES,
@@ -8,7 +8,7 @@ from canwall.sweep.law_tables import (
     format_law_table,
     format_worst,
 )
-from canwall.sweep.plan import Plan, make_plan
+from canwall.sweep.plan import Plan, make_plan, repeat_strike
 from canwall.sweep.strike import OPERATORS, Operator, PreparedStrike
 from canwall.sweep.tables import ineffective_axis_notes, sweep_table
 
@@ -24,7 +24,9 @@ __all__ = [
     "format_worst",
     "ineffective_axis_notes",
     "make_plan",
+    "plan_of",
     "read_sweep",
+    "repeat_strike",
     "sweep",
     "sweep_table",
     "write_sweep",

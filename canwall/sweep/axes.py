@@ -11,7 +11,7 @@ from canwall.config import ConfigError, Settings, with_overrides
 from canwall.config.drive import MILLI_NM
 from canwall.config.simulation import BREAKAWAY
 from canwall.cycle import with_law
-from canwall.errors import InputError
+from canwall.errors import InputError, did_you_mean
 from canwall.run.closed_loop import cached_servo_scales, loop_delay
 from canwall.simdrive import TORQUE_LIMITS
 from canwall.sweep.strike import OPERATORS, SERVOS, law_model, strike_settings
@@ -99,6 +99,10 @@ def parse_axis(name: str, given: object) -> SweepAxis:
     A range has N values, geometrically spaced for a stiffness and evenly for everything else;
     "LO:HI:N:log" and "LO:HI:N:lin" choose the spacing. Raises InputError.
     """
+    if name not in NAMED and "." not in name:
+        hint = did_you_mean(name, NAMED)
+        known = f"; known are {', '.join(NAMED)}, and keys of the configuration"
+        raise InputError(f"sweep axis {name}: unknown{hint or known}")
     if isinstance(given, str):
         values = tuple(v for part in given.split(",") for v in _parse_part(name, part.strip()))
     elif isinstance(given, Sequence):
@@ -149,6 +153,7 @@ def _check(name: str, value: Value) -> None:
         if value not in _CHOICES[name]:
             raise InputError(
                 f"sweep axis {name}: has to be one of {', '.join(_CHOICES[name])}, not {value!r}"
+                f"{did_you_mean(str(value), _CHOICES[name])}"
             )
         return
     if name not in NAMED or name == "law":

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.errors import InputError, RunFailedError
+from canwall.extras import need
 from canwall.sweep.dataset import versions
 from canwall.sweep.plan import PieceResult, Plan, compute_piece
 
@@ -22,14 +23,13 @@ def compute_on_cluster(plan: Plan, pieces: Sequence[int], address: str) -> Itera
     """Yield the pieces with their numbers as the workers of the scheduler finish them.
 
     Raises:
-        InputError: If there is no scheduler at the address.
+        InputError: If there is no scheduler at the address, or no Dask here.
         RunFailedError: If the scheduler is lost, or if scheduler or workers have other software
             than this machine.
     """
-    try:
-        import distributed
-    except ImportError:
-        raise InputError("--dask needs dask.distributed: install canwall[dask]") from None
+    need("dask")
+    import distributed
+
     # What they log is also raised, or was recovered from (a worker lost with its result). Some of
     # the loggers have a level of their own.
     for name in list(logging.root.manager.loggerDict):

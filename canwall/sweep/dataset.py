@@ -13,9 +13,10 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from canwall.analysis.strike import MEASURE_DESCRIPTIONS
+from canwall.config import parse
 from canwall.errors import InputError
 from canwall.run.closed_loop import loop_delay, simulated_units
-from canwall.sweep.axes import NAMED
+from canwall.sweep.axes import DAMPING, NAMED, STIFFNESS, STRIKES, SweepAxis
 from canwall.sweep.plan import Plan
 
 #: (unit, description) of what a search finds besides MEASURES.
@@ -141,6 +142,30 @@ def read_sweep(path: Path) -> xr.Dataset:
     if "configuration" not in dataset.attrs or "through" not in dataset.attrs:
         raise InputError(f"{path}: not the result of a sweep")
     return dataset
+
+
+def plan_of(dataset: xr.Dataset) -> Plan:
+    """Return the plan of a sweep from its result.
+
+    Raises:
+        InputError: If the result lacks what a sweep writes.
+        ConfigError: If this version cannot read its configuration.
+    """
+    base = parse(dataset.attrs["configuration"], Path("configuration of the sweep"))
+    found = dataset.get("limit", dataset.get("chatters"))
+    axes = [] if found is None else [str(name) for name in found.dims]
+    known = [next((n for n in axes if n in pair), None) for pair in (STIFFNESS, DAMPING)]
+    if found is None or known[1] is None or not set(STRIKES) <= set(axes):
+        raise InputError("not the result of a sweep: lacks its axes")
+
+    def axis(name: str) -> SweepAxis:
+        return SweepAxis(name, tuple(dataset[name].values.tolist()))
+
+    conditions = tuple(axis(n) for n in axes if n not in (*STRIKES, *known))
+    stiffness = known[0] and axis(known[0])
+    speed, phase = (axis(name) for name in STRIKES)
+    through = str(dataset.attrs["through"])
+    return Plan(base, conditions, stiffness or None, axis(known[1]), speed, phase, through)
 
 
 def _parameters(plan: Plan, point: Mapping[str, Any]) -> tuple[float, ...]:

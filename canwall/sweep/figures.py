@@ -3,31 +3,34 @@
 import itertools
 import math
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import matplotlib as mpl
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 from numpy.typing import NDArray
 
 from canwall.analysis.analytic_limits import stable_stiffness
 from canwall.errors import InputError
-from canwall.figure_style import COLOURS, STYLE
+from canwall.figure_style import CHATTER, DPI, REFERENT, STYLE, line_style
 from canwall.sweep.axes import DAMPING, STIFFNESS, STRIKES
 from canwall.sweep.labels import LABELS, axis_name, panel_title, shared_parameters
 from canwall.sweep.z_width import draw_z_width
 
 #: Panels of one figure; further ones go into further figures.
 _PANELS = 6
-#: Lines of one colour differ in these.
-_DASHES = ("-", "--", "-.", ":")
-_MARKS = "osD^v<>P"
+#: Widths of a panel and of a figure's margins [inches].
+_PANEL_IN, _MARGIN_IN = 3.5, 1.0
+#: Letters of a legend per inch, and those that the handle of an entry and its gaps take.
+_LETTERS_PER_INCH, _HANDLE_LETTERS = 13.0, 9
 
 Draw = Callable[[Axes, xr.Dataset], None]
+_Kind: TypeAlias = tuple[str, xr.Dataset, tuple[str, ...], Draw]
 
 
 def write_sweep_figures(dataset: xr.Dataset, stem: Path) -> list[Path]:
@@ -44,28 +47,56 @@ def write_sweep_figures(dataset: xr.Dataset, stem: Path) -> list[Path]:
         InputError: If the sweep is a single point or the figures cannot be written.
     """
     written: list[Path] = []
-    with mpl.rc_context(STYLE):
-        if "worst" in dataset:
-            for axis in _lines_over(dataset["worst"]):
-                label = f"limit-over-{axis.replace('.', '-')}"
-                written += _draw_panels(dataset, stem, label, ("law", axis), _limit_over(axis))
-            if not written:
-                written += _draw_panels(dataset, stem, "limits", ("law",), _limits_by_law)
-        else:
-            stiffness, damping = (axis_name(dataset, pair) for pair in (STIFFNESS, DAMPING))
-            if dataset.sizes[stiffness] > 1:
-                # Over K at the least damping; the map shows the others.
-                least = dataset.isel({damping: 0})
-                over = ("law", stiffness)
-                written += _draw_panels(least, stem, "energy", over, _energy(stiffness))
-                written += _draw_panels(least, stem, "amplitude", over, _amplitude(stiffness))
-                written += _draw_panels(least, stem, "frequency", over, _frequency(stiffness))
-            if dataset.sizes[damping] > 1 and dataset.sizes[stiffness] > 1:
-                over = (damping, stiffness)
-                written += _draw_panels(dataset, stem, "z-width", over, draw_z_width)
-    if not written:
-        raise InputError("the sweep has a single point: there is nothing to draw")
+    for name, figure in draw_sweep(dataset):
+        path = stem.with_name(f"{stem.name}-{name}.png")
+        try:
+            with mpl.rc_context(STYLE):
+                figure.savefig(path)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
+        written.append(path)
     return written
+
+
+def draw_sweep(dataset: xr.Dataset) -> Iterator[tuple[str, Figure]]:
+    """Yield name and figure of everything that the axes of the sweep allow to be drawn.
+
+    Raises InputError if the sweep is a single point.
+    """
+    kinds = _kinds(dataset)
+    if not kinds:
+        raise InputError("the sweep has a single point: there is nothing to draw")
+    for name, of_kind, drawn, draw in kinds:
+        with mpl.rc_context(STYLE):
+            figures = _draw_panels(of_kind, drawn, draw)
+        for number, figure in enumerate(figures, start=1):
+            yield f"{name}-{number}" if len(figures) > 1 else name, figure
+
+
+def _kinds(dataset: xr.Dataset) -> Sequence[_Kind]:
+    """Return the kinds of figures: name, part of the sweep, axes within its panels, drawing."""
+    if "worst" in dataset:
+        over: list[_Kind] = [
+            (f"limit-over-{axis.replace('.', '-')}", dataset, ("law", axis), _limit_over(axis))
+            for axis in _lines_over(dataset["worst"])
+        ]
+        return over or [("limits", dataset, ("law",), _limits_by_law)]
+    stiffness, damping = (axis_name(dataset, pair) for pair in (STIFFNESS, DAMPING))
+    if dataset.sizes[stiffness] == 1:
+        return []
+    # Over K at the least damping; the map shows the others.
+    least = dataset.isel({damping: 0})
+    kinds: list[_Kind] = [
+        (name, least, ("law", stiffness), draw(stiffness))
+        for name, draw in (
+            ("energy", _energy),
+            ("amplitude", _amplitude),
+            ("frequency", _frequency),
+        )
+    ]
+    if dataset.sizes[damping] > 1:
+        kinds.append(("z-width", dataset, (damping, stiffness), draw_z_width))
+    return kinds
 
 
 def _lines_over(array: xr.DataArray) -> list[str]:
@@ -74,35 +105,30 @@ def _lines_over(array: xr.DataArray) -> list[str]:
     return [d for d in numbers if array.sizes[d] > 2] or numbers
 
 
-def _draw_panels(
-    dataset: xr.Dataset, stem: Path, name: str, drawn: tuple[str, ...], draw: Draw
-) -> list[Path]:
+def _draw_panels(dataset: xr.Dataset, drawn: tuple[str, ...], draw: Draw) -> list[Figure]:
     """Draw a panel for each point of the axes that are not drawn inside the panels."""
     others = [str(d) for d in dataset.sizes if d not in drawn and d not in STRIKES]
     points = list(itertools.product(*(range(dataset.sizes[d]) for d in others)))
-    paths = []
+    figures = []
     for number in range(math.ceil(len(points) / _PANELS)):
         of_figure = points[number * _PANELS : (number + 1) * _PANELS]
-        columns = {1: 1, 2: 2, 4: 2}.get(len(of_figure), 3)
+        columns = min(len(of_figure), 2)
         rows = math.ceil(len(of_figure) / columns)
-        figure = Figure(figsize=(4.6 * columns + 1.0, 3.8 * rows), layout="constrained", dpi=120)
+        width = _PANEL_IN * columns + _MARGIN_IN
+        figure = Figure(figsize=(width, 3.3 * rows + 0.7), layout="constrained", dpi=DPI)
         for position, point in enumerate(of_figure, start=1):
             axes = figure.add_subplot(rows, columns, position)
             draw(axes, dataset.isel(dict(zip(others, point, strict=True))))
             axes.set_title(panel_title(dataset, dict(zip(others, point, strict=True))))
-        parameters = textwrap.fill(shared_parameters(dataset), 80 * columns)
-        figure.suptitle(parameters, fontsize=8, color="0.3", x=0.01, ha="left")
+        parameters = textwrap.fill(shared_parameters(dataset), round(13 * width))
+        figure.suptitle(parameters, fontsize=9, color="0.3", x=0.01, ha="left")
         handles, labels = _legend(figure)
         if handles:
-            figure.legend(handles, labels, loc="outside lower center", ncols=min(4, 2 * columns))
-        suffix = f"-{number + 1}" if len(points) > _PANELS else ""
-        path = stem.with_name(f"{stem.name}-{name}{suffix}.png")
-        try:
-            figure.savefig(path)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
-        paths.append(path)
-    return paths
+            room = int(_LETTERS_PER_INCH * width / (max(map(len, labels)) + _HANDLE_LETTERS))
+            ncols = max(1, min(room, len(labels)))
+            figure.legend(handles, labels, loc="outside lower center", ncols=ncols)
+        figures.append(figure)
+    return figures
 
 
 def _legend(figure: Figure) -> tuple[list[Any], list[str]]:
@@ -118,10 +144,7 @@ def _legend(figure: Figure) -> tuple[list[Any], list[str]]:
 
 def _styles(dataset: xr.Dataset) -> list[tuple[str, dict[str, Any]]]:
     """Return each law with the style of its lines; markers distinguish lines that coincide."""
-    return [
-        (str(law), {"color": COLOURS[i % 6], "ls": _DASHES[i // 6 % 4], "marker": _MARKS[i % 8]})
-        for i, law in enumerate(np.atleast_1d(dataset["law"].values))
-    ]
+    return [(str(law), line_style(i)) for i, law in enumerate(np.atleast_1d(dataset["law"].values))]
 
 
 def _limit_over(axis: str) -> Draw:
@@ -142,7 +165,7 @@ def _limit_over(axis: str) -> Draw:
             axes.yaxis.set_major_formatter("{x:g}")
             axes.yaxis.set_minor_formatter("{x:.2g}" if high < 10.0 * low else "")
         axes.set_xlabel(LABELS.get(axis, axis))
-        axes.set_ylabel("K-limit, K·T²/m (band: strikes)")
+        axes.set_ylabel("K-limit, K·T²/m [1] (band: strikes)")
 
     return draw
 
@@ -175,7 +198,10 @@ def _limits_by_law(axes: Axes, dataset: xr.Dataset) -> None:
     axes.set_yticks(range(dataset.sizes["law"]), [law for law, _ in _styles(dataset)])
     axes.invert_yaxis()
     axes.set_xscale("log")
-    axes.set_xlabel("K-limit, K·T²/m (◆ worst, · each strike)")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter("")
+    axes.set_xlabel("K-limit, K·T²/m [1] (◆ worst, · each strike)")
 
 
 def _label_over_stiffness(axes: Axes, dataset: xr.Dataset, name: str, label: str) -> None:
@@ -194,14 +220,15 @@ def _energy(stiffness: str) -> Draw:
             chatters = one["chatters"].any(STRIKES).values
             x = one[stiffness].values
             axes.plot(x, worst, label=law, **style | {"marker": ""})
-            axes.plot(x[chatters], worst[chatters], "x", color=style["color"], ms=4)
+            axes.plot(x[chatters], worst[chatters], "x", color=CHATTER, ms=5, zorder=3)
         # One count times the peak torque: the resolution of the energy.
         tolerance = dataset["energy_tolerance"].max((*STRIKES, "law")).values * 1e6
         axes.plot(
             dataset[stiffness].values,
             tolerance,
-            color="0.4",
-            lw=0.8,
+            color=REFERENT,
+            ls=(0, (8, 2, 1, 2)),
+            lw=0.9,
             label="one encoder count × peak torque",
         )
         axes.set_yscale("symlog", linthresh=1.0)

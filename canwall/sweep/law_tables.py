@@ -13,7 +13,7 @@ import xarray as xr
 
 from canwall.config import Settings
 from canwall.cycle import named_law
-from canwall.errors import InputError
+from canwall.errors import InputError, did_you_mean
 from canwall.sweep.axes import STRIKES
 from canwall.sweep.dataset import assemble_dataset
 from canwall.sweep.plan import Plan, make_plan
@@ -102,7 +102,8 @@ def compute_law_table(
         InputError: For a table, a law or an operator that does not exist.
     """
     if name not in LAW_TABLES:
-        raise InputError(f"--table {name}: has to be one of {', '.join(LAW_TABLES)}")
+        hint = did_you_mean(name, LAW_TABLES)
+        raise InputError(f"--table {name}: has to be one of {', '.join(LAW_TABLES)}{hint}")
     table = LAW_TABLES[name]
     base = base.model_copy(update={"sweep": {}})
     chosen = list(laws or table.laws or (named_law(base),))

@@ -2,10 +2,10 @@
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,9 @@ from canwall.sweep.axes import (
     parse_axis,
     settings_at,
 )
-from canwall.sweep.strike import PreparedStrike
+from canwall.sweep.strike import PreparedStrike, StrikeMotion
+
+_T = TypeVar("_T")
 
 #: Number of a piece of work, and its result as `compute_piece` returns it.
 PieceResult = tuple[int, NDArray[np.void]]
@@ -213,17 +215,61 @@ def compute_piece(plan: Plan, piece: int) -> NDArray[np.void]:
     Raises RunFailedError if a law does not return; the thread that evaluates it is left behind.
     """
     condition, strikes, walls = plan.slices(piece)
-    point = plan.points[condition]
-    prepared = [plan.prepare(point, strike) for strike in plan.strikes[strikes]]
-    computed: list[NDArray[np.void]] = []
+    point, chosen = plan.points[condition], plan.strikes[strikes]
+    prepared = [plan.prepare(point, strike) for strike in chosen]
+    return _supervised(lambda: _strike(plan, prepared, walls), prepared, point, chosen)
+
+
+def repeat_strike(
+    plan: Plan, indices: Mapping[str, int], stiffness: float | None = None
+) -> tuple[float, float, StrikeMotion]:
+    """Simulate the strike of one point again, in memory.
+
+    Args:
+        plan: The sweep.
+        indices: Index of the point on each axis.
+        stiffness: Stiffness of the wall where no axis has it, in a search [N·m/rad].
+
+    Returns:
+        Stiffness [N·m/rad] and damping [N·m·s/rad] of the wall, and the strike.
+
+    Raises:
+        ConfigError: If the configuration cannot be used here, for example for its dictionary.
+        RunFailedError: If the law does not return.
+    """
+    values = {axis.name: axis.values[indices[axis.name]] for axis in plan.axes}
+    point = {axis.name: values[axis.name] for axis in plan.conditions}
+    strike = {name: values[name] for name in STRIKES}
+    prepared = plan.prepare(point, strike)
+    stiffness_unit, damping_unit = _wall_units(plan, prepared)
+    damping = float(values[plan.damping.name]) * damping_unit
+    if stiffness is None:
+        assert plan.stiffness is not None
+        stiffness = float(values[plan.stiffness.name]) * stiffness_unit
+    wall = stiffness, damping
+    motion = _supervised(lambda: prepared.motion(*wall), [prepared], point, [strike])
+    return *wall, motion
+
+
+def _supervised(
+    compute: Callable[[], _T],
+    prepared: Sequence[PreparedStrike],
+    point: Mapping[str, Value],
+    strikes: Sequence[Mapping[str, Value]],
+) -> _T:
+    """Return what a computation with these strikes does.
+
+    Raises RunFailedError if a law does not return; the thread that evaluates it is left behind.
+    """
+    computed: list[_T] = []
     call = Call(
-        lambda: computed.append(_strike(plan, prepared, walls)),
+        lambda: computed.append(compute()),
         lambda: [strike.progress for strike in prepared],
     )
     while not call.has_ended():
         if call.computed_s < _LAW_S:
             continue
-        for strike, at in zip(prepared, plan.strikes[strikes], strict=True):
+        for strike, at in zip(prepared, strikes, strict=True):
             if evaluating := strike.evaluating:
                 call.give_up()
                 text = f"{evaluating} has not returned for {call.computed_s:.2g} s"
@@ -240,12 +286,18 @@ def _at(point: Mapping[str, Value], text: str) -> str:
     return ", ".join([*(f"{name} {value}" for name, value in point.items() if name != "law"), text])
 
 
+def _wall_units(plan: Plan, prepared: PreparedStrike) -> tuple[float, float]:
+    """Return stiffness [N·m/rad] and damping [N·m·s/rad] of a 1 on their axes."""
+    mass, period = prepared.mass, prepared.period
+    normalised = plan.stiffness is not None and plan.stiffness.name == "stiffness_normalised"
+    stiffness_unit = mass / period**2 if normalised else 1.0
+    return stiffness_unit, mass / period if plan.damping.name == "damping_normalised" else 1.0
+
+
 def _strike(plan: Plan, prepared: Sequence[PreparedStrike], walls: slice) -> NDArray[np.void]:
-    mass, period = prepared[0].mass, prepared[0].period
-    damping_unit = mass / period if plan.damping.name == "damping_normalised" else 1.0
+    stiffness_unit, damping_unit = _wall_units(plan, prepared[0])
     if plan.stiffness is None:
         (damping,) = plan.damping.values[walls]
         return k_limits(prepared, float(damping) * damping_unit)[:, None]
-    stiffness_unit = mass / period**2 if plan.stiffness.name == "stiffness_normalised" else 1.0
     chosen = [(float(k) * stiffness_unit, float(b) * damping_unit) for b, k in plan.walls[walls]]
     return prepared[0].on_all(np.array(chosen))[None, :]

@@ -1,5 +1,6 @@
 """One strike of an operator on a wall: as settings of a run, rendered, and judged."""
 
+import math
 import threading
 from dataclasses import dataclass
 
@@ -10,8 +11,8 @@ from canwall.analysis import AskedWall, ReferentInputs, follow_referent
 from canwall.analysis.felt import HANDLE_RADIUS_M, FeltBand, felt_band
 from canwall.analysis.strike import MEASURES, measure_strike
 from canwall.compiled import Record, compiled
-from canwall.config import ConfigError, Hand, Mechanics, Settings
-from canwall.cycle import named_law, run_laws
+from canwall.config import ConfigError, Hand, Mechanics, Settings, Simulation
+from canwall.cycle import named_law, run_laws, stiffest_for
 from canwall.errors import InputError, RunFailedError
 from canwall.record import ROW, Phase, Ring
 from canwall.run import drive_dictionary, make_axis, make_exchange, on_the_bus, render
@@ -137,7 +138,22 @@ def law_model(settings: Settings, knows: str, error: float) -> Mechanics:
             coulomb_nm=simulation.coulomb_nm,
             handle_radius_m=settings.mechanics.handle_radius_m,
         )
+        if simulation.shaft_hz:
+            model = model.model_copy(update=_known_shaft(simulation, model.inertia_kg_m2))
     return model.model_copy(update={"inertia_kg_m2": model.inertia_kg_m2 * (1.0 + error)})
+
+
+def _known_shaft(simulation: Simulation, inertia: float) -> dict[str, float]:
+    """Return the keys of the shaft in a model of this inertia [kg·m²], with a hand or without."""
+    rotor = simulation.rotor_inertia_kg_m2
+    alone = simulation.inertia_kg_m2
+    # The same spring and damper between other masses.
+    slower = math.sqrt((1.0 - rotor / alone) / (1.0 - rotor / inertia))
+    return {
+        "shaft_hz": simulation.shaft_hz * slower,
+        "shaft_damping_ratio": simulation.shaft_damping_ratio * slower,
+        "rotor_inertia_kg_m2": rotor,
+    }
 
 
 def strike_settings(
@@ -201,6 +217,25 @@ def strike_settings(
     )
 
 
+@dataclass(frozen=True)
+class StrikeMotion:
+    """One strike from SYNC to SYNC.
+
+    Attributes:
+        rows: Its cycles, dtype ROW, shape (n,).
+        felt: Mean forces on the hand over the period from each SYNC on [N·m], shape (n,).
+        referent: Positions of the continuous referent relative to the wall [rad], shape (n,).
+        referent_felt: The same forces of the referent [N·m], shape (n,).
+        measures: Measures of the strike, dtype MEASURES.
+    """
+
+    rows: NDArray[np.void]
+    felt: Array
+    referent: Array
+    referent_felt: Array
+    measures: np.void
+
+
 class PreparedStrike:
     """One strike, prepared once, to be rendered on one wall after another and judged."""
 
@@ -240,6 +275,8 @@ class PreparedStrike:
                 for value in (None, None, wall.damping_ratio, wall.cap)
             )
         )
+        #: On an elastic shaft the referent is no stiffer than the law aims at.
+        self._stiffest = stiffest_for(self._loop.cycle, self.mass)
         self._band = felt_band(settings.bus.cycle_s)
         self._radius = settings.mechanics.handle_radius_m or HANDLE_RADIUS_M
         self._by_frames = through == "bus"
@@ -307,11 +344,22 @@ class PreparedStrike:
                 AskedWall(*(values.copy() for values in self._asked)),
                 self._band,
                 self._radius,
+                self._stiffest,
                 walls,
                 np.zeros(1, ROW),
                 measures,
             )
         return measures
+
+    def motion(self, stiffness: float, damping: float) -> StrikeMotion:
+        """Strike a wall of this stiffness [N·m/rad] and damping [N·m·s/rad], in memory."""
+        rows, measures = np.zeros(self._cycles, ROW), np.zeros(1, MEASURES)
+        signals = np.empty((SIGNALS, self._cycles))
+        done = simulate_wall(self._loop, stiffness, damping, rows, signals)
+        judged = np.ascontiguousarray(signals[:, self._loop.enabling : done])
+        trip = int(self._loop.cycle["trip"][0])
+        y, felt = self._judged(stiffness, damping, judged, trip, measures)
+        return StrikeMotion(rows[:done], signals[3, :done], y[:done], felt[:done], measures[0])
 
     def _strike_over_bus(self, stiffness: float, damping: float) -> np.void:
         wall = {"stiffness_nm_per_rad": stiffness, "damping_nm_s_per_rad": damping}
@@ -319,24 +367,38 @@ class PreparedStrike:
             self._settings.model_copy(update={"wall": self._settings.wall.model_copy(update=wall)})
         )
         felt = self._felt_under(signals[2], stiffness, damping)
+        signals = np.concatenate([signals[:3], felt[None, :], signals[3:]])
+        measures = np.zeros(1, MEASURES)
+        self._judged(stiffness, damping, signals, trip, measures)
+        return measures[0]
+
+    def _judged(
+        self,
+        stiffness: float,
+        damping: float,
+        signals: Array,
+        trip: int,
+        measures: NDArray[np.void],
+    ) -> tuple[Array, Array]:
+        """Judge a strike into measures, shape (1,); return the referent's y and its felt force."""
         referent, referent_felt = np.empty(self._cycles), np.empty(self._cycles)
         asked = self._asked._replace(
-            stiffness=np.full(self._cycles, stiffness), damping=np.full(self._cycles, damping)
+            stiffness=np.full(self._cycles, min(stiffness, self._stiffest)),
+            damping=np.full(self._cycles, damping),
         )
         follow_referent(self._referent, asked, referent, referent_felt)
-        measures = np.zeros(1, MEASURES)
         _judge(
             self._loop,
             self._band,
             self._radius,
-            np.concatenate([signals[:3], felt[None, :], signals[3:]]),
+            signals,
             trip,
             referent,
             referent_felt,
             stiffness,
             measures,
         )
-        return measures[0]
+        return referent, referent_felt
 
     def _felt_under(self, torque: Array, stiffness: float, damping: float) -> Array:
         """Return the forces on the hand, which no frame tells, under the torques of a strike.
@@ -365,6 +427,7 @@ def _strike_all(
     asked: AskedWall,
     band: FeltBand,
     radius: float,
+    stiffest: float,
     walls: Array,
     rows: NDArray[np.void],
     measures: NDArray[np.void],
@@ -374,7 +437,7 @@ def _strike_all(
     signals = np.empty((SIGNALS, cycles))
     referent, referent_felt = np.empty(cycles), np.empty(cycles)
     for i in range(len(walls)):
-        asked.stiffness[:], asked.damping[:] = walls[i, 0], walls[i, 1]
+        asked.stiffness[:], asked.damping[:] = min(walls[i, 0], stiffest), walls[i, 1]
         done = simulate_wall(loop, walls[i, 0], walls[i, 1], rows, signals)
         cycle: Record = loop.cycle[0]
         follow_referent(hand, asked, referent, referent_felt)

@@ -9,6 +9,7 @@ import xarray as xr
 from rich.markup import escape
 from rich.table import Table
 
+from canwall.config import short_law
 from canwall.sweep.axes import DAMPING, STIFFNESS, STRIKES
 from canwall.sweep.labels import axis_name
 
@@ -23,7 +24,10 @@ def sweep_table(dataset: xr.Dataset) -> Table:
         if number == 0:
             for name in row:
                 table.add_column(
-                    escape(name), justify="left" if name == "law" else "right", no_wrap=True
+                    escape(name),
+                    justify="left" if name == "law" else "right",
+                    no_wrap=name != "law",
+                    overflow="fold",
                 )
         table.add_row(*map(escape, row.values()))
     return table
@@ -122,5 +126,5 @@ def _conditions(
         for name, i in index.items():
             if dataset.sizes[name] > 1 or name == "law":
                 value = dataset[name].values[i]
-                labels[name] = value if isinstance(value, str) else f"{value:g}"
+                labels[name] = short_law(value) if isinstance(value, str) else f"{value:g}"
         yield labels, index

@@ -12,6 +12,7 @@ from canwall.walls.bank import (
     predict_bank,
     reset_bank,
     set_bank,
+    stiffest,
     with_probe,
 )
 from canwall.walls.estimator import (
@@ -49,7 +50,8 @@ from canwall.walls.interface import (
     set_referent,
 )
 from canwall.walls.layers import TENSION, set_applied_force, wall_force
-from canwall.walls.registry import LAWS, find_law
+from canwall.walls.registry import LAWS, declare_law, find_law, is_declared
+from canwall.walls.shaft import ElasticShaft, WallLoop, stiffest_wall
 
 __all__ = [
     "BANK",
@@ -61,8 +63,10 @@ __all__ = [
     "MAX_FILTERS",
     "TENSION",
     "WALL",
+    "ElasticShaft",
     "Law",
     "UnknownLawError",
+    "WallLoop",
     "acting_force",
     "actuation_state",
     "call_law",
@@ -70,10 +74,12 @@ __all__ = [
     "clear_memory",
     "correct",
     "correct_bank",
+    "declare_law",
     "end_lag",
     "find_law",
     "force_walk_of",
     "hand_damping",
+    "is_declared",
     "law",
     "likelier",
     "may_lag",
@@ -93,6 +99,8 @@ __all__ = [
     "stand_still",
     "start_lagging",
     "start_open_loop",
+    "stiffest",
+    "stiffest_wall",
     "wall_force",
     "with_probe",
 ]

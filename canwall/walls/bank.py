@@ -28,6 +28,7 @@ from canwall.walls.regression import (
     reset_regression,
     set_regression,
 )
+from canwall.walls.shaft import ElasticShaft
 
 #: Largest number of filters.
 MAX_FILTERS = 24
@@ -37,6 +38,7 @@ MAX_FILTERS = 24
 BANK = np.dtype(
     [
         ("adapts", "?"),
+        ("holds", "?"),  # the mass in force, whatever is learned meanwhile; nothing is probed
         ("count", "i8"),
         ("log_lightest", "f8"),
         ("log_step", "f8"),
@@ -45,6 +47,14 @@ BANK = np.dtype(
         # [y, ẏ, d] of each filter, and its gain.
         ("state", "f8", (3, MAX_FILTERS)),
         ("gain", "f8", (3, MAX_FILTERS)),
+        # What a correction of the velocity says of position and force, and the number of equal
+        # samples from which on there is one.
+        ("with_velocity", "f8", (2, MAX_FILTERS)),
+        ("equal_samples", "f8", (MAX_FILTERS,)),
+        # Of what a sample differs from the prediction, the part that contradicts nothing.
+        ("within", "f8", (MAX_FILTERS,)),
+        ("sampled", "f8"),
+        ("equal", "i8"),  # samples in a row up to now
         # Over a period: Φ row by row, and the effects on (y, ẏ) of the older force, which acts up
         # to the instant of actuation, and of the newer one.
         ("phi", "f8", (4, MAX_FILTERS)),
@@ -55,6 +65,8 @@ BANK = np.dtype(
         ("transition", "f8", (MAX_FILTERS, 3, 3)),
         ("scale", "f8", (MAX_FILTERS, 3)),
         ("force_noise", "f8", (MAX_FILTERS,)),
+        # The stiffest wall on an elastic shaft.
+        ("stiffest", "f8", (MAX_FILTERS,)),
         ("regression", REGRESSION, (1,)),
         # Place of the mass in force on the scale of the filters' numbers.
         ("place", "f8"),
@@ -70,9 +82,17 @@ BANK = np.dtype(
 _FORGOTTEN_S = 0.2
 #: Share of the way to the likeliest mass that is gone in a period.
 _FOLLOWED = 0.6
-#: Power of the mass with which the walk of a hand's force falls. What the steps of the encoder make
-#: felt at the handle grows with mass and bandwidth; so it stays below what is felt for all.
-_STEADINESS = 0.7
+#: Mass over the lightest one up to which all filters have one bandwidth, and the power of the mass
+#: with which that of heavier ones falls. What the steps of the encoder make felt at the handle
+#: grows with mass and bandwidth; but under a filter that is slow against the wall a handle that
+#: breaks loose slips far, and friction and the bias force hunt.
+_AS_QUICK, _STEADINESS = 3.0, 0.52
+#: Share of half a count within which a reading does not contradict the prediction of a heavy hand,
+#: whose motion between two samples is known better than that. A light one needs each correction.
+_WITHIN = 0.8
+#: Time constants of a filter for which samples have to be equal before its velocity is bounded by
+#: them, and the most samples: a filter that is slower than that finds rest by itself.
+_EQUAL, _EQUAL_SAMPLES = 8.0, 32.0
 #: Time constant at which a light hand's damping equals its inertia [s].
 _HAND_S = 1.5e-3
 
@@ -94,6 +114,8 @@ def set_bank(
     count: float,
     force_walk: float,
     delay: float,
+    shaft: ElasticShaft | None = None,
+    margin: float = 0.0,
 ) -> None:
     """Write the filters into a BANK array (1,).
 
@@ -104,8 +126,11 @@ def set_bank(
         spring: Spring of all.
         period: T [s].
         count: One count of the encoder [rad].
-        force_walk: See `kalman_model`; that of the lightest.
+        force_walk: See `kalman_model`; that of the lightest, and on an elastic shaft of all.
+            The others are as quick as the lightest, from 3 times its mass on slower.
         delay: D in periods; its fraction counts.
+        shaft: What joins rotor and handle. Default: they are one.
+        margin: Part of the delay that the filters alone have, not the regression. In periods.
     """
     n = len(masses)
     if not 3 <= n <= MAX_FILTERS:
@@ -116,12 +141,20 @@ def set_bank(
     bank["log_step"] = math.log(masses[-1] / masses[0]) / (n - 1)
     bank["spring"] = spring
     bank["forgotten"] = round(_FORGOTTEN_S / period)
-    set_regression(bank["regression"][0, 0], float(masses[0]), period, count, delay)
+    told = max(delay - margin, math.floor(delay))  # of the same torques in flight
+    set_regression(bank["regression"][0, 0], float(masses[0]), period, count, told, shaft)
+    bank["stiffest"], bank["within"] = np.inf, 0.0
     bank["viscous"][0, :n] = viscous
     for i in range(n):
-        walk = force_walk * float(masses[0] / masses[i]) ** _STEADINESS
+        walk = force_walk
+        if shaft is None:
+            heavier = float(masses[i] / masses[0])
+            slower = min(1.0, _AS_QUICK / heavier)
+            walk *= heavier * slower ** (3.0 * _STEADINESS)  # by the cube of the bandwidth
+            bank["within"][0, i] = 0.5 * _WITHIN * (1.0 - slower) * abs(count)
         model = kalman_model(masses[i], viscous[i], spring, period, count, walk)
         _set_filter(bank[0], i, model)
+        _set_rest(bank[0], i, model, period)
         phi, _ = zoh(masses[i], viscous[i], spring, period)
         _, before = zoh(masses[i], viscous[i], spring, fraction * period)
         phi_after, after = zoh(masses[i], viscous[i], spring, (1.0 - fraction) * period)
@@ -136,6 +169,15 @@ def _set_filter(bank: np.void, i: int, model: KalmanModel) -> None:
     bank["scale"][i], bank["force_noise"][i] = model.scale, model.force_noise
 
 
+def _set_rest(bank: np.void, i: int, model: KalmanModel, period: float) -> None:
+    """Write what equal samples say of a filter, by its covariance after a sample."""
+    scale, prior = model.scale, model.covariance
+    after = prior - np.outer(model.gain / scale * scale[0], prior[0])
+    bank["with_velocity"][:, i] = after[[0, 2], 1] / after[1, 1] * scale[[0, 2]] / scale[1]
+    equal = _EQUAL * scale[0] / (scale[1] * period)
+    bank["equal_samples"][i] = equal if equal <= _EQUAL_SAMPLES else math.inf
+
+
 def reset_bank(bank: NDArray[np.void], y: float) -> None:
     """Begin at rest at y with the lightest hand."""
     bank["state"] = 0.0
@@ -144,6 +186,7 @@ def reset_bank(bank: NDArray[np.void], y: float) -> None:
     bank["place"], bank["spread"] = 0.0, 0.0
     bank["mass"] = np.exp(bank["log_lightest"])
     bank["at_rest"] = 0
+    bank["sampled"], bank["equal"] = y, 0
 
 
 @compiled
@@ -157,13 +200,16 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
     if not estimator.settled:
         for i in range(n):
             state[0, i], state[1, i], state[2, i] = estimator.y, estimator.v, estimator.d
+        bank.equal = 0
         begin_regression(bank.regression[0], y_sample)
         return False
     for i in range(n):
         residual = y_sample - state[0, i]
+        residual -= min(max(residual, -bank.within[i]), bank.within[i])
         state[0, i] += gain[0, i] * residual
         state[1, i] += gain[1, i] * residual
         state[2, i] += gain[2, i] * residual
+    _bound_velocity(bank, y_sample)
     changed = _identify(bank, estimator, y_sample)
     k = min(int(bank.place), n - 2)
     share = bank.place - k
@@ -178,14 +224,40 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
 
 
 @compiled
+def _bound_velocity(bank: Record, y_sample: float) -> None:
+    """Let no filter move faster than equal samples allow: by a count each way meanwhile.
+
+    Stiction is in no model: a filter would have a handle that sticks creep under the wall's force,
+    until its bias force has followed, and the wall would push until it breaks loose. Its state is
+    projected onto the bound with its covariance (Simon, IET Control Theory Appl. 4, 2010).
+    """
+    bank.equal = bank.equal + 1 if y_sample == bank.sampled else 0
+    bank.sampled = y_sample
+    if bank.equal == 0:
+        return
+    regression, state, also = bank.regression[0], bank.state, bank.with_velocity
+    fastest = 2.0 * regression.resolution / (bank.equal * regression.period)
+    for i in range(bank.count):
+        if bank.equal < bank.equal_samples[i]:
+            continue
+        excess = min(max(state[1, i], -fastest), fastest) - state[1, i]
+        state[0, i] += also[0, i] * excess
+        state[1, i] += excess
+        state[2, i] += also[1, i] * excess
+
+
+@compiled
 def _identify(bank: Record, estimator: Record, y_sample: float) -> bool:
     """Follow what a sample tells of the mass; return True if the mass in force changed."""
     learned = learn(bank.regression[0], estimator, y_sample, bank.mass)
     if _torque_acted(estimator):
         bank.at_rest = 0
-        return learned and _follow(bank)
+        return learned and not bank.holds and _follow(bank)
     bank.at_rest += 1
-    return bank.at_rest == bank.forgotten and _forget(bank)
+    if bank.at_rest != bank.forgotten:
+        return False
+    forget_mass(bank.regression[0])
+    return not bank.holds and _forget(bank)
 
 
 @compiled
@@ -201,6 +273,9 @@ def _follow(bank: Record) -> bool:
     """Move the mass in force towards the likeliest one; return True if it moved."""
     likeliest, deviation = lightness(bank.regression[0])
     bank.spread = deviation / max(likeliest, deviation)
+    if likeliest > 0.0:
+        # Rotor and load together.
+        likeliest /= 1.0 + bank.regression[0].rotor * likeliest
     step = _FOLLOWED * (_place_of(bank, likeliest) - bank.place)
     bank.place += step
     bank.mass = _mass_at(bank, bank.place)
@@ -210,7 +285,6 @@ def _follow(bank: Record) -> bool:
 @compiled
 def _forget(bank: Record) -> bool:
     """Begin with the lightest hand again; return True if another one was in force."""
-    forget_mass(bank.regression[0])
     changed = bank.place != 0.0
     bank.place, bank.spread = 0.0, 0.0
     bank.mass = _mass_at(bank, 0.0)
@@ -229,6 +303,14 @@ def _place_of(bank: Record, likeliest: float) -> float:
         return bank.count - 1.0
     place = (-math.log(likeliest) - bank.log_lightest) / bank.log_step
     return min(max(place, 0.0), bank.count - 1.0)
+
+
+@compiled
+def stiffest(bank: Record) -> float:
+    """Return the stiffness of the stiffest wall on an elastic shaft, with the mass in force."""
+    k = min(int(bank.place), bank.count - 2)
+    share = bank.place - k
+    return bank.stiffest[k] + share * (bank.stiffest[k + 1] - bank.stiffest[k])
 
 
 @compiled
@@ -263,8 +345,8 @@ def predict_bank(bank: Record, estimator: Record, force: float) -> None:
 
 @compiled
 def with_probe(bank: Record, wall: Record, force: float) -> float:
-    """Return the force of a law, and where that is zero the torque of a probe."""
-    if force == 0.0:
+    """Return the force of a law, and where that is zero the torque of a probe, unless it holds."""
+    if force == 0.0 and not bank.holds:
         return probe(bank.regression[0], wall)
     bank.regression[0].probed = 0
     return force

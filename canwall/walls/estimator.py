@@ -54,6 +54,7 @@ ESTIMATOR = np.dtype(
         ("viscous", "f8"),
         ("coulomb", "f8"),
         ("delay_periods", "i8"),
+        ("margin", "f8"),  # part of the delay that the model alone has [periods]
         ("full", _HOLD, (1,)),
         ("before", _HOLD, (1,)),
         ("after", _HOLD, (1,)),
@@ -133,16 +134,18 @@ def set_estimator(
     count: float,
     force_walk: float,
     delay: float,
+    margin: float = 0.0,
 ) -> None:
     """Write model, gain and delay D (in periods, 0 ≤ D ≤ MAX_DELAY) into an ESTIMATOR array (1,).
 
-    count and force_walk are those of `kalman_model`. Raises ValueError for a delay out of range.
+    count and force_walk are those of `kalman_model`; the loop is quicker than D by `margin`.
+    Raises ValueError for a delay out of range.
     """
     if not 0.0 <= delay <= MAX_DELAY:
         raise ValueError(f"a delay of {delay:g} periods is not between 0 and {MAX_DELAY}")
     whole = math.floor(delay)
     fraction = delay - whole
-    estimator["delay_periods"] = whole
+    estimator["delay_periods"], estimator["margin"] = whole, margin
     estimator["mass"], estimator["viscous"] = mass, viscous
     estimator["coulomb"] = coulomb
     kalman = kalman_model(mass, viscous, spring, period, count, force_walk)
@@ -404,8 +407,10 @@ def acting_force(estimator: Record, in_flight: NDArray[np.float64]) -> float:
 
     in_flight: as `ESTIMATOR` has them, newest first, or a part of them.
     """
-    n = estimator.delay_periods
     share = estimator.before[0].duration / estimator.full[0].duration
+    delay = max(estimator.delay_periods + share - estimator.margin, 0.0)
+    n = int(delay)
+    share = delay - n
     force = in_flight[n]
     if share > 0.0:
         force = share * in_flight[n + 1] + (1.0 - share) * force

@@ -15,7 +15,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled, compiled_for_c
-from canwall.errors import InputError
+from canwall.errors import InputError, did_you_mean
 from canwall.physics import PLANT, capped_stiffness, damping_of_ratio, zoh, zoh_coefficients
 
 #: Numbers that the record has room for: options of a law, and its memory.
@@ -64,6 +64,8 @@ WALL = np.dtype(
         ("asked_damping", "f8"),
         ("damping_ratio", "f8"),
         ("cap", "f8"),
+        # Where there is a cap: the largest stiffness on an elastic shaft with the mass in force.
+        ("stiffest", "f8"),
         # The law's options, in the order in which its file declares them.
         ("option_values", "f8", (MAX_OPTIONS,)),
     ],
@@ -159,7 +161,8 @@ class Law:
         for name in given:
             if name not in self.options:
                 known = ", ".join(self.options) or "none"
-                raise UnknownLawError(f"law {self.name} has no option {name!r}; it has {known}")
+                hint = did_you_mean(name, self.options) or f"; it has {known}"
+                raise UnknownLawError(f"law {self.name} has no option {name!r}{hint}")
         return [given.get(name, default) for name, default in self.options.items()]
 
 
@@ -221,6 +224,7 @@ def set_referent(
     wall["damping"] = wall["asked_damping"] = damping
     wall["referent"]["wall_stiffness"] = stiffness
     wall["referent"]["wall_damping"] = damping
+    wall["stiffest"] = np.inf
     wall["option_values"] = 0.0
     wall["option_values"][0, : len(options)] = options
 
@@ -243,7 +247,7 @@ def put_in_force(wall: Record) -> None:
     if wall.cap > 0.0:
         growth = _GROWTH_INSIDE if wall.y_sample < 0.0 else _GROWTH_OUTSIDE
         allowed = capped_stiffness(stiffness, wall.cap, wall.mass, wall.period)
-        stiffness = min(allowed, growth * wall.stiffness)
+        stiffness = min(allowed, wall.stiffest, growth * wall.stiffness)
     wall.stiffness = stiffness
     wall.damping = damping_of_ratio(wall.asked_damping, wall.damping_ratio, stiffness, wall.mass)
 

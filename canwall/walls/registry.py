@@ -1,7 +1,10 @@
 """The laws by name: the one list that the loop, the workbench and the messages read."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import FunctionType
 
+from canwall.errors import did_you_mean
 from canwall.walls import (
     damped,
     energy_bounding,
@@ -21,7 +24,7 @@ from canwall.walls import (
     virtual_coupling,
 )
 from canwall.walls.interface import DEADBEAT, Law, UnknownLawError
-from canwall.walls.user_law import load_law
+from canwall.walls.user_law import load_law, make_law
 
 #: Every law that comes with the project, by name.
 LAWS: dict[str, Law] = {
@@ -48,11 +51,36 @@ LAWS: dict[str, Law] = {
     if isinstance(found, Law)
 }
 
+#: Laws of the user, by `file.py:function`, or by the name of a function declared as a law.
 _user_laws: dict[str, Law] = {}
 
 
+def declare_law(function: FunctionType, options: Mapping[str, float]) -> Law:
+    """Declare a function of the running program as a law; it is known by the function's name.
+
+    One declared before by the same name is replaced, as when a cell of a notebook is executed
+    again.
+
+    Raises:
+        UnknownLawError: If the function is no law, or a law of the project has its name.
+    """
+    name = function.__name__
+    if name in LAWS:
+        raise UnknownLawError(f"{name}: a law of the project has this name; choose another")
+    _user_laws[name] = make_law(name, function, dict(options))
+    return _user_laws[name]
+
+
+def is_declared(name: str) -> bool:
+    """Return True for a law that exists in this process alone."""
+    return name in _user_laws and ":" not in name
+
+
 def find_law(name: str, deadbeat: bool = False) -> Law:
-    """Return the law of that name, or of that `file.py:function`. Raises UnknownLawError."""
+    """Return the law of that name, declared or of that `file.py:function`.
+
+    Raises UnknownLawError.
+    """
     if deadbeat:
         name += DEADBEAT
     if name in LAWS:
@@ -62,11 +90,19 @@ def find_law(name: str, deadbeat: bool = False) -> Law:
         raise UnknownLawError(
             f"law {name.removesuffix(DEADBEAT)} has no deadbeat compensation; {able} have"
         )
+    if name in _user_laws:
+        return _user_laws[name]
     path, colon, function = name.rpartition(":")
     if not colon:
         raise UnknownLawError(
-            f"unknown law {name!r}; known are {', '.join(LAWS)}, or file.py:function"
+            f"unknown law {name!r}"
+            + (_meant(name) or f"; known are {', '.join(LAWS)}, or file.py:function")
         )
-    if name not in _user_laws:
-        _user_laws[name] = load_law(Path(path), function)
+    _user_laws[name] = load_law(Path(path), function)
     return _user_laws[name]
+
+
+def _meant(name: str) -> str:
+    """Return the hint at the closest law; the compensation makes all names alike."""
+    bare = (law for law in LAWS if not law.endswith(DEADBEAT))
+    return did_you_mean(name.removesuffix(DEADBEAT), bare)

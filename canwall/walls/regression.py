@@ -6,6 +6,8 @@ the torque, plus b/m times that of the velocity, plus something steady from a ha
 changes steadily. What changes more slowly (the operator's push, friction in one direction) is in
 none of them.
 
+On an elastic shaft it is the load that is observed, by what the rotor tells of it.
+
 The torque is the wall's, or a probe's: shortly before a contact the handle is pushed to and fro by
 a few counts, so that a light hand is told from a heavy one before the wall acts.
 """
@@ -17,6 +19,7 @@ from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
 from canwall.walls.estimator import MAX_DELAY
+from canwall.walls.shaft import ElasticShaft
 
 #: Number of samples that are kept: two differences give the velocity to come.
 _RECENT = 3
@@ -26,12 +29,21 @@ REGRESSION = np.dtype(
     [
         ("period", "f8"),
         ("resolution", "f8"),  # one count [rad]
-        ("lightest", "f8"),  # smallest mass that there may be
+        ("lightest", "f8"),  # smallest mass that there may be, beyond an elastic shaft
         ("delay_share", "f8"),  # of a period, up to the instant of actuation
         # The observer of [y, ẏ, ÿ], its gain, and its state for positions, torque (of a unit mass)
         # and velocity; what it does not expect of them at this sample, and one count.
         ("gain", "f8", (3,)),
         ("observed", "f8", (3, 3)),
+        # Inertia of the rotor on an elastic shaft, 0: rigid, and compliance of the shaft over T²;
+        # for a unit mass under the torque, the part of its next second difference that the last
+        # period made, and the second difference; torque in the shaft and position behind it.
+        ("rotor", "f8"),
+        ("softness", "f8"),
+        ("begun", "f8"),
+        ("bend", "f8"),
+        ("shaft_torque", "f8"),
+        ("load", "f8"),
         ("surprise", "f8", (4,)),
         ("information", "f8", (4, 4)),  # weighted sums of their products
         ("noise", "f8"),  # mean square of what nothing explains [rad²]
@@ -40,6 +52,7 @@ REGRESSION = np.dtype(
         ("way", "f8"),  # to the last sample [rad]
         ("steady", "i8"),  # samples in a row that moved on in one direction
         ("probe", "f8"),  # torque before a contact [N·m]
+        ("probe_samples", "i8"),  # half its period
         ("probed", "i8"),  # samples of the present probe
         ("probing", "?"),  # the force of this cycle is a probe's
         ("probes", "f8", (MAX_DELAY + 1,)),  # torques of probes in flight, newest first
@@ -47,8 +60,9 @@ REGRESSION = np.dtype(
     align=True,
 )
 
-#: Bandwidth of the observer, faster than what hand and friction do meanwhile [Hz].
-_OBSERVER_HZ = 100.0
+#: Bandwidth of the observer, faster than what hand and friction do meanwhile [Hz], and behind an
+#: elastic shaft, of which little is known near its resonance.
+_OBSERVER_HZ, _OBSERVER_BEHIND_SHAFT_HZ = 100.0, 50.0
 #: Noise of its surprise by the steps of the encoder [counts], and share of the noise that is
 #: exchanged with a sample: drives latch their position at ticks of their own.
 _QUANTISATION, _NOISE_SHARE = 0.5, 1.0 / 16.0
@@ -79,7 +93,12 @@ _PROBE_COUNTS = 4.0
 
 
 def set_regression(
-    regression: np.void, lightest: float, period: float, count: float, delay: float
+    regression: np.void,
+    lightest: float,
+    period: float,
+    count: float,
+    delay: float,
+    shaft: ElasticShaft | None = None,
 ) -> None:
     """Write a regression's settings.
 
@@ -89,24 +108,30 @@ def set_regression(
         period: T [s].
         count: One count of the encoder [rad].
         delay: D in periods; its fraction counts.
+        shaft: What joins rotor and handle. Default: they are one.
     """
     regression["period"], regression["resolution"] = period, abs(count)
-    regression["lightest"] = lightest
+    regression["rotor"] = shaft.rotor if shaft else 0.0
+    regression["softness"] = 1.0 / (shaft.stiffness * period**2) if shaft else 0.0
+    regression["lightest"] = lightest - regression["rotor"]
     regression["delay_share"] = delay - math.floor(delay)
-    regression["gain"] = gain = _observer_gain(period)
+    bandwidth = _OBSERVER_BEHIND_SHAFT_HZ if shaft else _OBSERVER_HZ
+    regression["gain"] = gain = _observer_gain(bandwidth, period)
     regression["surprise"][3] = abs(count)
     regression["hand_torque"] = _HAND_RATE * period / gain[2]
-    quarter = 0.5 * _PROBE_SAMPLES * period
-    regression["probe"] = _PROBE_COUNTS * abs(count) * lightest / quarter**2
+    slower = round(_OBSERVER_HZ / bandwidth)
+    regression["probe_samples"] = samples = slower * _PROBE_SAMPLES
+    quarter = 0.5 * samples * period
+    regression["probe"] = slower * _PROBE_COUNTS * abs(count) * lightest / quarter**2
 
 
-def _observer_gain(period: float) -> NDArray[np.float64]:
+def _observer_gain(bandwidth: float, period: float) -> NDArray[np.float64]:
     """Return the gain that gives the observer of [y, ẏ, ÿ] three equal poles p.
 
     They are at its bandwidth, but no faster than a tenth of the sample rate. It is the
     fading-memory filter of third order: 1 − p³, 1.5·(1 − p)²·(1 + p)/T, (1 − p)³/T².
     """
-    pole = math.exp(-2.0 * math.pi * min(_OBSERVER_HZ * period, 0.1))
+    pole = math.exp(-2.0 * math.pi * min(bandwidth * period, 0.1))
     rest = 1.0 - pole
     return np.array([1.0 - pole**3, 1.5 * rest**2 * (1.0 + pole) / period, rest**3 / period**2])
 
@@ -115,7 +140,9 @@ def reset_regression(regression: np.void, y: float) -> None:
     """Begin at rest at y, with nothing known of the mass."""
     for name in ("observed", "information", "way", "steady", "probed", "probing", "probes"):
         regression[name] = 0
-    regression["observed"][0, 0] = y
+    for name in ("begun", "bend", "shaft_torque"):
+        regression[name] = 0.0
+    regression["observed"][0, 0] = regression["load"] = y
     regression["samples"] = y
     regression["noise"] = (_QUANTISATION * regression["resolution"]) ** 2
 
@@ -124,7 +151,8 @@ def reset_regression(regression: np.void, y: float) -> None:
 def begin_regression(regression: Record, y: float) -> None:
     """Begin at rest at y; what is known of the mass stays."""
     regression.observed[:] = 0.0
-    regression.observed[0, 0] = y
+    regression.observed[0, 0] = regression.load = y
+    regression.shaft_torque = 0.0
     regression.samples[:] = y
     regression.way = 0.0
     regression.steady = regression.probed = 0
@@ -143,7 +171,11 @@ def learn(regression: Record, estimator: Record, y_sample: float, mass: float) -
 
     estimator: with the torques in flight. mass: the one in force.
     """
-    _observe(regression, y_sample)
+    mass -= regression.rotor
+    if regression.rotor > 0.0:
+        _observe(regression, _advance_load(regression, y_sample))
+    else:
+        _observe(regression, y_sample)
     steps = _torque_steps(estimator) * regression.period * regression.period
     explained = _is_explained(regression, steps)
     _note_way(regression, y_sample, explained)
@@ -155,7 +187,8 @@ def learn(regression: Record, estimator: Record, y_sample: float, mass: float) -
         return True
     tells = regression.steady >= _STEADY and (regression.probed > 0 or told > 1.0)
     if tells or told > _STRONG:
-        _add_information(regression, _UNTIMELY * steps / mass, mass)
+        untimely = _UNTIMELY * steps / mass + _UNTIMELY * steps * regression.softness
+        _add_information(regression, untimely, mass)
         return True
     return False
 
@@ -168,6 +201,37 @@ def _observe(regression: Record, y_sample: float) -> None:
         surprise[c] = (y_sample if c == 0 else 0.0) - observed[0, c]
         for i in range(3):
             observed[i, c] += regression.gain[i] * surprise[c]
+
+
+@compiled
+def _advance_load(regression: Record, y_sample: float) -> float:
+    """Advance the observer to the sample before this one, behind an elastic shaft.
+
+    The shaft carries what of the torque does not accelerate the rotor, τ = f − J_r·ÿ, and the load
+    is at y − τ/k: the motion of a rigid mass under τ. The second difference of the positions is a
+    mean of ÿ about the sample before, as that of a unit mass is of f.
+
+    Returns:
+        Position of the load at the sample before.
+    """
+    t, x, samples = regression.period, regression.observed, regression.samples
+    second = y_sample - 2.0 * samples[0] + samples[1]
+    before, torque = (
+        regression.shaft_torque,
+        (regression.bend - regression.rotor * second) / (t * t),
+    )
+    load = samples[0] - regression.softness * t * t * torque
+    for c in range(3):
+        x[0, c] += t * x[1, c] + 0.5 * t * t * x[2, c]
+        x[1, c] += t * x[2, c]
+    # From the one torque to the other in a straight line.
+    x[0, 1] += t * t * (before / 3.0 + torque / 6.0)
+    x[1, 1] += 0.5 * t * (before + torque)
+    way = load - regression.load
+    x[0, 2] += 0.5 * t * way
+    x[1, 2] += way
+    regression.shaft_torque, regression.load = torque, load
+    return load
 
 
 @compiled
@@ -185,6 +249,7 @@ def _is_explained(regression: Record, steps: float) -> bool:
     """Return True if there is a mass for which the torque explains the motion."""
     rest = abs(regression.surprise[0]) - _UNEXPLAINED * math.sqrt(regression.noise)
     torque = abs(regression.surprise[1]) + _UNTIMELY_MOST * steps
+    torque += _UNTIMELY_MOST * steps * regression.softness * regression.lightest
     return rest * regression.lightest <= torque
 
 
@@ -234,7 +299,7 @@ def _doubt(regression: Record) -> None:
 
 @compiled
 def lightness(regression: Record) -> tuple[float, float]:
-    """Return the likeliest 1/m and its standard deviation.
+    """Return the likeliest 1/m, of the load on an elastic shaft, and its standard deviation.
 
     They are the least squares of r₀ + r₁·(1/m) − r₂·(b/m) − r₃·c, with what is known before the
     first torque; c is what is steady.
@@ -257,12 +322,18 @@ def lightness(regression: Record) -> tuple[float, float]:
 def predict_regression(regression: Record, older: float, newer: float) -> None:
     """Advance the observer by a period under the torques before and after the actuation."""
     t, share, x = regression.period, regression.delay_share, regression.observed
+    rest = 1.0 - share
+    way = t * t * (share * (1.0 - 0.5 * share) * older + 0.5 * rest * rest * newer)
+    speed = t * (share * older + rest * newer)
+    if regression.rotor > 0.0:
+        regression.bend = regression.begun + way
+        regression.begun = t * speed - way
+        return
     for c in range(3):
         x[0, c] += t * x[1, c] + 0.5 * t * t * x[2, c]
         x[1, c] += t * x[2, c]
-    rest = 1.0 - share
-    x[0, 1] += t * t * (share * (1.0 - 0.5 * share) * older + 0.5 * rest * rest * newer)
-    x[1, 1] += t * (share * older + rest * newer)
+    x[0, 1] += way
+    x[1, 1] += speed
     y = regression.samples
     # In the middle of the coming period, extrapolated from the middles of the last two.
     v = (2.0 * y[0] - 3.0 * y[1] + y[2]) / t
@@ -281,7 +352,8 @@ def probe(regression: Record, wall: Record) -> float:
         regression.probed = 0
         return 0.0
     # The first half is half as long: the handle is pushed about its own path.
-    swing = (regression.probed + _PROBE_SAMPLES // 2) // _PROBE_SAMPLES
+    half = regression.probe_samples
+    swing = (regression.probed + half // 2) // half
     regression.probed += 1
     regression.probing = True
     return regression.probe if swing % 2 == 0 else -regression.probe

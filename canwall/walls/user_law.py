@@ -1,11 +1,10 @@
-"""A user's law, named by file and function: `my_law.py:my_law`.
+"""A user's law: a function in a file, `my_law.py:my_law`, or one declared in a running program.
 
-The function takes one record (`interface.WALL`) and returns the force. If the file has a dictionary
-OPTIONS, `[wall.options]` may set its entries, and the function reads them by name:
-`wall.options.growth`.
+The function takes one record (`interface.WALL`) and returns the force. Options, which
+`[wall.options]` may set, are the dictionary OPTIONS of the file, or given with the declaration;
+the function reads them by name: `wall.options.growth`.
 """
 
-import difflib
 import dis
 import importlib.util
 import inspect
@@ -16,15 +15,17 @@ import re
 import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import FunctionType, ModuleType
+from types import FunctionType
 from typing import Any
 
 import numpy as np
 from numba import from_dtype, njit, types
 from numba.core import cgutils, ir
+from numba.core.dispatcher import Dispatcher
 from numba.core.errors import NumbaError
 from numba.extending import intrinsic
 
+from canwall.errors import did_you_mean
 from canwall.walls.interface import MAX_OPTIONS, Law, UnknownLawError, wall_with
 
 
@@ -44,26 +45,40 @@ def load_law(path: Path, function: str) -> Law:
     written = getattr(module, function, None)
     if not isinstance(written, FunctionType):
         raise UnknownLawError(f"{where}: the file has no such function")
+    return make_law(where, written, getattr(module, "OPTIONS", {}))
+
+
+def make_law(name: str, written: FunctionType, options: object) -> Law:
+    """Return a function as a law, compiled and checked.
+
+    Args:
+        name: Name of the law, which the messages begin with.
+        written: The function; it may stand anywhere, in a notebook as well.
+        options: Names and defaults of its options.
+
+    Raises:
+        UnknownLawError: If the function is no law, or does not compile.
+    """
     arguments = len(inspect.signature(written).parameters)
     if arguments != 1:
-        raise UnknownLawError(f"{where}: takes {arguments} arguments; a law takes one, the wall")
-    options = _declared_options(where, getattr(module, "OPTIONS", {}))
-    guarded = _Guarded(written, options)
-    law = Law(where, guarded.function, options, cached=False, failure=guarded.failure)
+        raise UnknownLawError(f"{name}: takes {arguments} arguments; a law takes one, the wall")
+    declared = _declared_options(name, options)
+    guarded = _Guarded(written, declared)
+    law = Law(name, guarded.function, declared, cached=False, failure=guarded.failure)
     try:
         _check_types(guarded.compile())
         law.compile()
     except UnsuitableLawError as error:
-        raise UnknownLawError(f"{where}: {error}") from None
+        raise UnknownLawError(f"{name}: {error}") from None
     except NumbaError as error:
-        line = _line_in(path, str(error))
-        raise UnknownLawError(f"{where}: {line}does not compile: {_gist(error)}") from None
+        line = _line_in(Path(written.__code__.co_filename), str(error))
+        raise UnknownLawError(f"{name}: {line}does not compile: {_gist(error)}") from None
     except KeyError as error:  # numba's, for a field that a record does not have
-        name = str(error.args[0])
-        line = _line_of_field(module, name)
-        raise UnknownLawError(f"{where}: {line}{_unknown_field(name, options)}") from None
+        field = str(error.args[0])
+        line = _line_of_field(written, field)
+        raise UnknownLawError(f"{name}: {line}{_unknown_field(field, declared)}") from None
     except Exception as error:  # numba lets what it trips over through
-        raise UnknownLawError(f"{where}: {type(error).__name__}: {_gist(error)}") from None
+        raise UnknownLawError(f"{name}: {type(error).__name__}: {_gist(error)}") from None
     return law
 
 
@@ -71,30 +86,27 @@ class UnsuitableLawError(Exception):
     """A function that compiles, but is no law."""
 
 
-def _declared_options(where: str, options: object) -> Mapping[str, float]:
+def _declared_options(law: str, options: object) -> Mapping[str, float]:
     if not (
         isinstance(options, dict)
         and all(isinstance(n, str) and isinstance(v, int | float) for n, v in options.items())
     ):
-        raise UnknownLawError(f"{where}: OPTIONS has to be a dictionary of names and numbers")
+        raise UnknownLawError(f"{law}: OPTIONS has to be a dictionary of names and numbers")
     for name in options:
         if not name.isidentifier() or keyword.iskeyword(name):
             raise UnknownLawError(
-                f"{where}: OPTIONS: {name!r} cannot be read as wall.options.{name}; rename it"
+                f"{law}: OPTIONS: {name!r} cannot be read as wall.options.{name}; rename it"
             )
     if len(options) > MAX_OPTIONS:
-        raise UnknownLawError(
-            f"{where}: {len(options)} options; a law may have up to {MAX_OPTIONS}"
-        )
+        raise UnknownLawError(f"{law}: {len(options)} options; a law may have up to {MAX_OPTIONS}")
     return options
 
 
 def _unknown_field(name: str, options: Mapping[str, float]) -> str:
     if name == "options":
-        return "uses wall.options, but its file declares no OPTIONS"
+        return "uses wall.options, but declares no OPTIONS"
     fields = [f for f in wall_with(options).names or () if f not in ("option_values", "options")]
-    close = difflib.get_close_matches(name, [*fields, *options], n=1)
-    hint = f"; did you mean {close[0]}?" if close else ""
+    hint = did_you_mean(name, [*fields, *options])
     declared = f"; options: {', '.join(options)}" if options else ""
     return (
         f"uses {name}, which is neither a field of the wall nor an option{hint} "
@@ -102,14 +114,15 @@ def _unknown_field(name: str, options: Mapping[str, float]) -> str:
     )
 
 
-def _line_of_field(module: ModuleType, name: str) -> str:
-    """Return where a module's functions first use an attribute, as the beginning of a message."""
-    written = [inspect.unwrap(value) for value in vars(module).values() if callable(value)]
-    codes = [function.__code__ for function in written if isinstance(function, FunctionType)]
+def _line_of_field(law: FunctionType, name: str) -> str:
+    """Return where a law, or a function beside it, uses an attribute first, to begin a message."""
+    beside = [f for f in law.__globals__.values() if isinstance(f, FunctionType | Dispatcher)]
+    written = [inspect.unwrap(function) for function in (law, *beside)]
+    codes = [f.__code__ for f in written if isinstance(f, FunctionType)]
     lines = [
         instruction.positions.lineno
         for code in codes
-        if code.co_filename == module.__file__
+        if code.co_filename == law.__code__.co_filename
         for instruction in dis.get_instructions(code)
         if instruction.argval == name and instruction.positions is not None
     ]
@@ -243,7 +256,9 @@ class _Guarded:
             frames = traceback.extract_tb(candidate.__traceback__) if candidate else []
             places = [f for f in frames if f.filename == self._written.__code__.co_filename]
             if places:
-                return f" ({Path(places[-1].filename).name}, line {places[-1].lineno})"
+                file, line = Path(places[-1].filename), places[-1].lineno
+                # The file of a notebook's cell has a name that nobody has given it.
+                return f" ({file.name}, line {line})" if file.exists() else f" (line {line})"
         return ""
 
 

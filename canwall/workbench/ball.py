@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
-from canwall.errors import InputError, RunFailedError
+from canwall.errors import InputError, RunFailedError, did_you_mean
 from canwall.physics import advance, make_plant
 from canwall.walls import (
     TENSION,
@@ -91,7 +91,10 @@ class Ball:
         if not hardest <= MAX_THETA:
             raise InputError(f"T·√(K/m) has to be {MAX_THETA:g} or below, not {hardest:g}")
         if self.tension not in TENSION:
-            raise InputError(f"tension has to be one of {', '.join(TENSION)}, not {self.tension!r}")
+            hint = did_you_mean(self.tension, TENSION)
+            raise InputError(
+                f"tension has to be one of {', '.join(TENSION)}, not {self.tension!r}{hint}"
+            )
 
     @property
     def theta(self) -> float:

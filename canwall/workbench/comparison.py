@@ -4,8 +4,10 @@ A ball of 1 kg under 1 m/s² meets a floor of 1 N/m at 5 m/s. The period T varie
 θ = T·√(K/m), and for each T the phase at which the ball enters.
 """
 
+import textwrap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
-from canwall.figure_style import COLOURS
+from canwall.figure_style import DPI, PAGE_IN, line_style
 from canwall.walls import HORIZON
 from canwall.workbench.ball import CONTINUOUS, Ball
 from canwall.workbench.bounces import Bounces, entering, over_phases
@@ -30,10 +32,12 @@ THETA = (0.05, 3.0)
 _CONTACT_S, _PERIODS = 12.0, 8
 #: Bound of the linear part of the energy axis.
 _LINEAR = 1e-3
+#: Line of the continuous wall without damping, below those of the laws.
+_UNDAMPED: dict[str, Any] = {"color": "0.75", "lw": 3.0, "zorder": 1}
+#: Dashes of the continuous wall with damping, unlike those of the laws.
+_FINE = (0, (8, 2, 1, 2))
 #: Gain in ln E that rounding may cause.
 _ROUNDING = 1e-9
-#: Colours of lines: the palette without its yellow, which is too light for them.
-_LINES = (*COLOURS[:6], COLOURS[7])
 
 
 @dataclass(frozen=True)
@@ -219,26 +223,22 @@ def _join(items: list[str]) -> str:
 def _draw(
     grid: Array, results: Mapping[str, list[LawResult]], referents: Mapping[float, LawResult]
 ) -> Figure:
-    figure = Figure(figsize=(13.0, 11.0), layout="constrained", dpi=120)
+    figure = Figure(figsize=(PAGE_IN, 9.0), layout="constrained", dpi=DPI)
     grids = figure.subplots(3, len(GROUPS), sharex=True, sharey="row", squeeze=False)
     tensions, peaks = (_shares(name, results, referents) for name in ("tension", "peak"))
     for column, (group, laws) in zip(grids.T, GROUPS.items(), strict=True):
         energy, tension, peak = column
-        energy.set_title(group)
+        energy.set_title(textwrap.fill(group, 24))
         for number, law in enumerate(laws):
             found = results[law]
             # Some laws agree to the last bit: different dashes keep both lines visible.
-            style = {
-                "color": _LINES[number],
-                "lw": 1.6,
-                "ls": ("-", (0, (5, 2)), (2, (3, 1, 1, 1)), (0, (1, 1)))[number % 4],
-            }
+            style = line_style(number) | {"lw": 1.4, "marker": None}
             energy.plot(grid, _values(found, "mean"), label=law, **style)
             energy.fill_between(
                 grid,
                 _values(found, "least"),
                 _values(found, "most"),
-                color=_LINES[number],
+                color=style["color"],
                 alpha=0.12,
                 lw=0.0,
             )
@@ -246,11 +246,11 @@ def _draw(
             peak.plot(grid, peaks[law], **style)
         if any(chosen.damping for chosen in laws.values()):
             label = f"continuous, B = {DAMPING:g} N·s/m"
-            energy.axhline(referents[DAMPING].mean, color=REFERENT, ls="--", lw=1.1, label=label)
-        energy.axhline(0.0, color="k", lw=0.8, zorder=1, label="continuous, undamped")
-        peak.axhline(1.0, color="k", lw=0.8, zorder=1)
+            energy.axhline(referents[DAMPING].mean, color=REFERENT, ls=_FINE, lw=1.1, label=label)
+        energy.axhline(0.0, **_UNDAMPED, label="continuous, undamped")
+        peak.axhline(1.0, **_UNDAMPED)
         handles, labels = energy.get_legend_handles_labels()
-        peak.legend(handles, labels, loc="upper center", bbox_to_anchor=(0.5, -0.22), ncols=2)
+        peak.legend(handles, labels, loc="upper center", bbox_to_anchor=(0.5, -0.25), ncols=1)
         peak.set_xlabel("θ = T·√(K/m)")
     _set_scales(*grids[:, 0])
     return figure
@@ -259,7 +259,7 @@ def _draw(
 def _set_scales(energy: Axes, tension: Axes, peak: Axes) -> None:
     plain = FuncFormatter(lambda value, place: f"{value:g}")
     energy.set_xscale("log")
-    energy.xaxis.set_major_locator(FixedLocator([0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 3.0]))
+    energy.xaxis.set_major_locator(FixedLocator([0.05, 0.1, 0.2, 0.5, 1.0, 3.0]))
     energy.xaxis.set_major_formatter(plain)
     energy.xaxis.set_minor_locator(NullLocator())
     energy.set_yscale("symlog", linthresh=_LINEAR)

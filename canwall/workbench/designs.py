@@ -6,15 +6,29 @@ import numpy as np
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from canwall.workbench.ball import CONTINUOUS
+from canwall.figure_style import COLUMN_IN, PAGE_IN, line_style
+from canwall.workbench.ball import CONTINUOUS, Ball, simulate_ball
 from canwall.workbench.bounces import Bounces
-from canwall.workbench.figure_page import FORCE, REFERENT, SAMPLES, FigurePage, blank, legend_below
+from canwall.workbench.figure_page import (
+    FORCE,
+    REFERENT,
+    RENDERED,
+    SAMPLES,
+    FigurePage,
+    blank,
+    legend_below,
+    mark_delay,
+)
 from canwall.workbench.traces import BALL, POINTS, POSITION, TIME, Traces, around, drop_ball
 
 Array = NDArray[np.float64]
 
 #: Range of drop heights with which the variability in Figure 5.12 is judged [m].
 DROPS = (11.0, 13.0)
+#: Laws whose roots are in Figure 5.13, and the values of θ over which they move and at marks.
+_ROOTS = ("standard", "half_sample", "pole_placement")
+_THETAS = np.linspace(0.01, 2.0, 200)
+_MARKED = (0.25, 1.0, 2.0)
 
 
 def _draw_overview(
@@ -50,7 +64,8 @@ def _draw_close_up(
             where=(pull > 0.0).tolist(),
             step="post",
             color=FORCE,
-            alpha=0.35,
+            alpha=0.3,
+            hatch="////",
             lw=0.0,
             label="the floor pulls",
         )
@@ -145,8 +160,8 @@ def draw_long_term(seconds: float, drops: int) -> Iterator[FigurePage]:
     bounces = drop_ball("half_sample", seconds)
     t, y = bounces.between(POINTS)
     title = "Figure 5.12: half-sample prediction, long-term"
-    figure, axes = blank(title, TIME, "height y [m]", (11.0, 4.6))
-    axes.axhline(0.0, color="k", lw=0.8)
+    figure, axes = blank(title, TIME, "height y [m]", (PAGE_IN, 3.6))
+    axes.axhline(0.0, color="0.6", lw=0.8)
     axes.plot(t, y, color=SAMPLES, lw=0.4, alpha=0.7, label="sampled-data floor")
     top = 1 + np.flatnonzero((y[1:-1] > 0.0) & (y[1:-1] > y[:-2]) & (y[1:-1] >= y[2:]))
     axes.plot(t[top], y[top], "o", color=SAMPLES, ms=4.0, label="height of a bounce")
@@ -168,6 +183,131 @@ def draw_long_term(seconds: float, drops: int) -> Iterator[FigurePage]:
         f"{drops} drops from {DROPS[0]:g} to {DROPS[1]:g} m {both} deviate both more than 1% above "
         "and more than 1% below their first height in this time.",
         {"t [s]": t, "y rendered [m]": y, "y target [m]": np.full(len(t), BALL.height)},
+        figure,
+    )
+
+
+def closed_loop_roots(law: str, theta: float) -> NDArray[np.complex128]:
+    """Return the roots of the ball on a law's floor, from state to state inside; shape (2,).
+
+    They are those of the law as it is compiled: of the affine map of one period, which three
+    states tell. Time is in units of √(m/K), as θ = T·√(K/m).
+    """
+    inside = ((-9.0, 0.0), (-9.1, 0.0), (-9.0, 0.1))
+    after = np.array(
+        [
+            [z[1] for z in simulate_ball(Ball(height=y, speed=v, period=theta, periods=1), law)[:2]]
+            for y, v in inside
+        ]
+    )
+    steps = (after[1:] - after[0]) / np.array([[-0.1], [0.1]])
+    return np.asarray(np.linalg.eigvals(steps.T), dtype=np.complex128)
+
+
+def draw_roots() -> Iterator[FigurePage]:
+    """Draw figure 5.13."""
+    title = "Figure 5.13: roots of the floor in the z-plane"
+    figure, axes = blank(title, "Re z [1]", "Im z [1]", (COLUMN_IN, 4.4))
+    angle = np.linspace(0.0, np.pi, 200)
+    axes.plot(np.cos(angle), np.sin(angle), color=REFERENT, lw=1.0, ls="--", label="unit circle")
+    columns: dict[str, Array] = {"theta [1]": _THETAS}
+    found = {}
+    for number, law in enumerate(_ROOTS):
+        roots = {theta: closed_loop_roots(law, theta) for theta in (*_THETAS, *_MARKED)}
+        upper = {theta: pair[np.argmax(pair.imag)] for theta, pair in roots.items()}
+        locus = np.array([upper[theta] for theta in _THETAS])
+        style = line_style(number)
+        mark = style.pop("marker")
+        # Marks where θ has the values that are named.
+        marked = [int(np.argmin(np.abs(_THETAS - theta))) for theta in _MARKED]
+        axes.plot(
+            locus.real,
+            locus.imag,
+            lw=1.5,
+            marker=mark,
+            markevery=marked,
+            ms=6.0,
+            label=law,
+            **style,
+        )
+        at = np.array([upper[theta] for theta in _MARKED])
+        columns |= {f"Re z {law} [1]": locus.real, f"Im z {law} [1]": locus.imag}
+        found[law] = np.abs(at)
+    columns |= {"Re z desired [1]": np.cos(_THETAS), "Im z desired [1]": np.sin(_THETAS)}
+    for theta in _MARKED:
+        place = 0.9 * np.array([np.cos(theta), np.sin(theta)])
+        left = theta > 0.5 * np.pi
+        axes.annotate(f"θ = {theta:g}", place, ha="left" if left else "right", va="top")
+    axes.locator_params(nbins=6)
+    axes.axhline(0.0, color="0.6", lw=0.8)
+    axes.set_aspect("equal")
+    legend_below(figure, axes)
+    moduli = "; ".join(
+        f"{law} {', '.join(f'{modulus:.4f}' for modulus in of_law)}"
+        for law, of_law in found.items()
+    )
+    yield FigurePage(
+        "figure_5_13",
+        title,
+        "The roots of the sampled system that are wanted are those of a mass on a spring, a pair "
+        "on the unit circle; the state feedback puts them there.",
+        f"The wanted roots are exp(±iθ). Modulus at θ = {', '.join(f'{x:g}' for x in _MARKED)} "
+        f"(above 1 a contact gains energy): {moduli}.",
+        columns,
+        figure,
+    )
+
+
+def continuous_crossings() -> tuple[float, float]:
+    """Return the times at which the ball enters the continuous floor and leaves it [s] (5.11)."""
+    entry = np.sqrt(2.0 * BALL.height / BALL.gravity)
+    omega = np.sqrt(BALL.stiffness / BALL.mass)
+    inside = 2.0 * (np.pi - np.arctan(omega * entry)) / omega
+    return float(entry), float(entry + inside)
+
+
+def draw_sampling_points() -> Iterator[FigurePage]:
+    """Draw figure 5.15."""
+    entry, leave = continuous_crossings()
+    period = BALL.period
+    m, n = int(np.ceil(entry / period)), int(np.ceil(leave / period))
+    traces = Traces.of(drop_ball("half_sample+deadbeat"), slice(m - 2, n + 1))
+    title = "Figure 5.15: sampling points in one contact"
+    figure, axes = blank(title, TIME, "height y [m]")
+    axes.axhline(0.0, color="0.6", lw=0.8)
+    axes.plot(traces.t, traces.referent, color=RENDERED, lw=2.0, label="continuous floor")
+    at = traces.at_sample == 1
+    t, y = traces.t[at], traces.referent[at]
+    axes.plot(t, y, "o", color=SAMPLES, ms=4.0, label="sampling points")
+    mark_delay(axes, "Δt$_a$", (m - 1) * period, entry)
+    mark_delay(axes, "Δt$_b$", leave, n * period)
+    for name, sample, x, side in (
+        ("$t_{m-1}$", m - 1, -8.0, "right"),
+        ("$t_m$", m, -8.0, "right"),
+        ("$t_{n-1}$", n - 1, 8.0, "left"),
+        ("$t_n$", n, 8.0, "left"),
+    ):
+        axes.annotate(
+            name,
+            (sample * period, y[sample - (m - 2)]),
+            xytext=(x, 0.0),
+            textcoords="offset points",
+            ha=side,
+            va="center",
+            fontsize=11,
+        )
+    axes.margins(x=0.15, y=0.15)
+    legend_below(figure, axes)
+    yield FigurePage(
+        "figure_5_15",
+        title,
+        "Samples fall anywhere on the motion of a strike; the first inside is named m, the first "
+        "outside again n, and the times next to them, before the entry and after the exit, are "
+        "what the compensation computes.",
+        f"m = {m}, n = {n}: the ball flies for Δt_a = {entry - (m - 1) * period:.4f} s after the "
+        f"last sample outside, and has left for Δt_b = {n * period - leave:.4f} s at the first one "
+        f"(T = {period:g} s).",
+        {"t [s]": traces.t, "at a sample [0 or 1]": traces.at_sample, "y [m]": traces.referent},
         figure,
     )
 

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.analysis import metrics
+from canwall.figure_style import CHATTER
 from canwall.workbench.bounces import Bounces, continuous_between, over_phases
 from canwall.workbench.figure_page import (
-    ACCENT,
     FORCE,
     REFERENT,
     RENDERED,
@@ -17,6 +17,7 @@ from canwall.workbench.figure_page import (
     FigurePage,
     blank,
     legend_below,
+    mark_delay,
     stairs,
 )
 from canwall.workbench.traces import BALL, POSITION, SHORT_S, TIME, Traces, around, drop_ball
@@ -51,10 +52,10 @@ def draw_hysteresis_loop() -> Iterator[FigurePage]:
     depth = -traces.y
     deepest = float(depth.max())
     title = "Figure 5.3: tracing out the virtual wall"
-    figure, axes = blank(title, "penetration x = −y [m]", "force f out of the wall [N]", (7.0, 5.4))
+    figure, axes = blank(title, "penetration x = −y [m]", "force f out of the wall [N]", (4.6, 4.2))
     # Held over each interval: a line along x at constant force, then the step to the next force.
     x, force = np.repeat(depth, 2)[1:], np.repeat(traces.force, 2)[:-1]
-    axes.fill(x, force, color=FORCE, alpha=0.15, lw=0.0, label="energy put out")
+    axes.fill(x, force, color=CHATTER, alpha=0.2, lw=0.0, label="energy put out")
     axes.plot(x, force, color=FORCE, lw=1.3, label="held force")
     line = np.array([0.0, deepest])
     axes.plot(line, BALL.stiffness * line, color=REFERENT, ls="--", lw=1.1, label="f = K·x")
@@ -115,7 +116,7 @@ def draw_time_chart(phases: int) -> Iterator[FigurePage]:
     traces = Traces.of(bounces, around(contact))
     title = "Figure 5.4: time chart of one strike"
     figure, axes = blank(title, TIME, POSITION)
-    axes.axhline(0.0, color="k", lw=0.8)
+    axes.axhline(0.0, color="0.6", lw=0.8)
     axes.plot(traces.t, traces.y, color=RENDERED, lw=2.4, label="position y")
     at = traces.at_sample == 1
     axes.plot(traces.t[at], traces.y[at], "o", color=SAMPLES, ms=4.0, label="samples")
@@ -125,17 +126,7 @@ def draw_time_chart(phases: int) -> Iterator[FigurePage]:
         ("Δt$_a$", bounces.t[contact.start], on_s),
         ("Δt$_b$", bounces.t[contact.stop - 1], off_s),
     ):
-        axes.axvspan(switched - delay, switched, color=ACCENT, alpha=0.3, lw=0.0)
-        axes.annotate(
-            name,
-            (switched - 0.5 * delay, 1.0),
-            xycoords=("data", "axes fraction"),
-            xytext=(0.0, -3.0),
-            textcoords="offset points",
-            ha="center",
-            va="top",
-            fontsize=12,
-        )
+        mark_delay(axes, name, switched - delay, switched)
     axes.margins(x=0.01, y=0.1)
     legend_below(figure, axes)
     stored = 0.5 * BALL.stiffness * bounces.y[contact.start] ** 2

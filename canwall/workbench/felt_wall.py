@@ -4,13 +4,23 @@ from collections.abc import Iterator
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 from numpy.typing import NDArray
 
 from canwall import config
 from canwall.analysis.analytic_limits import DiolaitiRegion, diolaiti_region
 from canwall.analysis.impedance import EffectiveImpedance, impedance_at_lines, multisine
 from canwall.config import Settings
-from canwall.figure_style import COLOURS
+from canwall.figure_style import (
+    CHATTER,
+    CHATTER_AREA,
+    COLOURS,
+    COLUMN_IN,
+    DPI,
+    PAGE_IN,
+    QUIET_AREA,
+    line_style,
+)
 from canwall.record import ROW
 from canwall.run.closed_loop import (
     ENABLING_CYCLES,
@@ -42,10 +52,10 @@ _BETA, _SIGMA = (0.3, 8.0), (0.03, 8.0)
 #: motion that a limit cycle of the quantised position may have.
 _JUDGED, _FEW_COUNTS = slice(-450, -300), 20
 _SHADES = {
-    DiolaitiRegion.PASSIVE: "#cfe8dc",
+    DiolaitiRegion.PASSIVE: QUIET_AREA,
     DiolaitiRegion.LIMIT_CYCLE: "#dbe7f3",
     DiolaitiRegion.LOCALLY_STABLE: "#f7efcb",
-    DiolaitiRegion.UNSTABLE: "#f6d5c3",
+    DiolaitiRegion.UNSTABLE: CHATTER_AREA,
 }
 
 
@@ -92,32 +102,35 @@ def measure_impedance(law: str) -> EffectiveImpedance:
 def draw_impedance() -> Iterator[FigurePage]:
     """Draw the stiffness and the damping that are felt, over frequency."""
     title = "Effective impedance of a wall"
-    figure = Figure(figsize=(11.0, 4.6), layout="constrained", dpi=120)
+    figure = Figure(figsize=(PAGE_IN, 4.2), layout="constrained", dpi=DPI)
     left, right = figure.subplots(1, 2)
-    figure.suptitle(title)
+    left.set_title(title)
     columns: dict[str, NDArray[np.float64]] = {}
-    for law, colour in zip(LAWS, COLOURS, strict=False):
+    for number, law in enumerate(LAWS):
+        style = line_style(number) | {"ms": 4.0, "mfc": "none", "lw": 1.2}
         found = measure_impedance(law)
         columns["frequency [Hz]"] = found.frequency
         columns[f"Re G {law} [N·m/rad]"] = found.impedance.real
         columns[f"B_eff {law} [N·m·s/rad]"] = found.damping
-        left.plot(found.frequency, found.impedance.real, ".-", color=colour, label=law)
-        right.plot(found.frequency, found.damping, ".-", color=colour)
+        left.plot(found.frequency, found.impedance.real, label=law, **style)
+        right.plot(found.frequency, found.damping, **style)
     frequency = columns["frequency [Hz]"]
     simulation = config.load(config.shipped("config/ideal.toml")).simulation
     assert simulation is not None
     ideal = _STIFFNESS - simulation.inertia_kg_m2 * (2.0 * np.pi * frequency) ** 2
     left.plot(frequency, ideal, "--", color=REFERENT, label="continuous wall")
-    right.axhline(_VISCOUS + _DAMPING, ls="--", color=REFERENT)
+    right.axhline(_VISCOUS + _DAMPING, ls="--", color=REFERENT, lw=1.5)
     right.axhline(0.0, color="k", lw=0.8)
     for axes, label in (
-        (left, "Re G = K_eff − M_eff·ω² [N·m/rad]"),
-        (right, "B_eff = Im G/ω [N·m·s/rad]"),
+        (left, "Re G = $K_{eff} - M_{eff}\\,ω^2$ [N·m/rad]"),
+        (right, "$B_{eff}$ = Im G/ω [N·m·s/rad]"),
     ):
         axes.set_xscale("log")
         axes.set_xlabel("frequency [Hz]")
+        axes.xaxis.set_major_formatter("{x:g}")
         axes.set_ylabel(label)
     left.set_yscale("symlog", linthresh=10.0)
+    left.yaxis.set_major_formatter("{x:g}")
     legend_below(figure, left)
     at_rest = ", ".join(f"{law} {columns[f'Re G {law} [N·m/rad]'][0]:.2f}" for law in LAWS)
     yield FigurePage(
@@ -151,7 +164,7 @@ def plain_wall_motion(beta: float, sigma: float) -> float:
 def draw_diolaiti_plane(points: int) -> Iterator[FigurePage]:
     """Draw the four regions, and what a plain wall does at `points` × `points` places."""
     title = "Plain wall in the plane of viscous damping and Coulomb friction (Diolaiti)"
-    figure, axes = blank(title, "β = b/(K·T)", "σ = f_c/(K·Δ)", (9.0, 6.2))
+    figure, axes = blank(title, "β = b/(K·T) [1]", "σ = $f_c$/(K·Δ) [1]", (COLUMN_IN, 4.4))
     settings = _bare_drive(0.0, 0.0)
     delay = loop_delay(settings)
     edge = 0.5 + delay
@@ -163,24 +176,27 @@ def draw_diolaiti_plane(points: int) -> Iterator[FigurePage]:
     ):
         region = diolaiti_region(np.sqrt(low * high), np.sqrt(bottom * top), delay)
         axes.fill_between([low, high], bottom, top, color=_SHADES[region], lw=0.0)
-        axes.text(low * 1.06, top / 1.08, str(region), va="top", fontsize=11)
+        axes.text(low * 1.06, top / 1.08, str(region), va="top")
     beta, sigma = (
         grid.ravel()
         for grid in np.meshgrid(np.geomspace(*_BETA, points), np.geomspace(*_SIGMA, points))
     )
     motion = np.array([plain_wall_motion(b, s) for b, s in zip(beta, sigma, strict=True)])
     outcomes = (
-        ("comes to rest", motion <= 1.0, "o", COLOURS[2]),
+        ("comes to rest", motion <= 1.0, "o", COLOURS[1]),
         ("a cycle of some counts", (motion > 1.0) & (motion <= _FEW_COUNTS), "s", COLOURS[0]),
-        ("buzzes", motion > _FEW_COUNTS, "x", COLOURS[1]),
+        ("buzzes", motion > _FEW_COUNTS, "x", CHATTER),
     )
     for label, chosen, mark, colour in outcomes:
-        axes.plot(beta[chosen], sigma[chosen], mark, color=colour, ms=6, label=label)
+        axes.plot(
+            beta[chosen], sigma[chosen], mark, color=colour, ms=4.5, label=label, clip_on=False
+        )
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xlim(*_BETA)
     axes.set_ylim(*_SIGMA)
     for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter("")
     legend_below(figure, axes)

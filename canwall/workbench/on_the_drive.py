@@ -1,4 +1,4 @@
-"""Figures 5.18 and 5.19 of the source: four strikes on the simulated drive, over the bus."""
+"""Figures 5.5, 5.18 and 5.19 of the source: strikes on the simulated drive, over the bus."""
 
 import math
 import tempfile
@@ -20,14 +20,23 @@ from canwall.config import Settings, Wall
 from canwall.cycle import make_cycle, run_laws, set_wall
 from canwall.drive import DriveSetup, PdoLayout
 from canwall.errors import RunFailedError
-from canwall.figure_style import COLOURS
+from canwall.figure_style import PAGE_IN
 from canwall.record import read_signals
-from canwall.record.pictures import draw_strikes
+from canwall.record.pictures import draw_strikes, law_colours
 from canwall.run import run
 from canwall.units import DriveUnits, to_per_mille
 from canwall.walls import find_law, set_applied_force, wall_force
 from canwall.workbench.bounces import crossing_time
-from canwall.workbench.figure_page import REFERENT, FigurePage, blank, legend_below, stairs
+from canwall.workbench.figure_page import (
+    ACCENT,
+    REFERENT,
+    SAMPLES,
+    FigurePage,
+    blank,
+    legend_below,
+    mark_delay,
+    stairs,
+)
 
 Array = NDArray[np.float64]
 
@@ -61,20 +70,62 @@ def record_run() -> RecordedRun:
         return RecordedRun(settings, read_signals(result.folder.signals), result.summary)
 
 
-def draw_four_strikes() -> Iterator[FigurePage]:
-    """Draw both figures from one run."""
-    recorded = record_run()
+def draw_strip_chart(recorded: RecordedRun) -> Iterator[FigurePage]:
+    """Draw figure 5.5: the first contact of the first strike, as recorded."""
+    contact = contacts_of_first_strike(recorded)[0]
+    shown = slice(contact.start - _AROUND, contact.stop + _AROUND)
+    wall, cycle_s = recorded.settings.wall, recorded.settings.bus.cycle_s
+    t, y = recorded.column("t_s")[shown] * 1e3, recorded.column("y")[shown] * 1e3
+    held = 0.0 - recorded.column("force_applied")[shown] / wall.stiffness_nm_per_rad * 1e3
+    title = "Figure 5.5: time chart of a recorded strike"
+    figure, axes = blank(title, "time t [ms]", "position y, −f/K [mrad]")
+    axes.axhline(0.0, color="0.6", lw=0.8)
+    axes.plot(t, y, "o-", color=SAMPLES, lw=0.9, ms=3.0, label="position y, each SYNC")
+    stairs(axes, t, held, "held force, −f/K")
+    spline = CubicSpline(t, y)
+    inside = np.flatnonzero(y < 0.0)
+    entry, leave = (
+        crossing_time(lambda s: float(spline(s)), 0.0, t[j], t[j + 1])
+        for j in (inside[0] - 1, inside[-1])
+    )
+    on, off = np.flatnonzero(held != 0.0)[[0, -1]] + [0, 1]
+    for name, crossed, switched in (("Δt$_a$", entry, t[on]), ("Δt$_b$", leave, t[off])):
+        mark_delay(axes, name, crossed, switched)
+    axes.margins(x=0.01, y=0.15)
+    legend_below(figure, axes)
+    yield FigurePage(
+        "figure_5_05",
+        title,
+        "A strike of an experimental wall shows what the idealised time chart does: the force is "
+        "switched on and off late, and lags the position in between.",
+        f"The first contact of `config/ideal.toml` ({wall.law}, "
+        f"K = {wall.stiffness_nm_per_rad:g} N·m/rad, T = {cycle_s * 1e3:g} ms) on the simulated "
+        f"drive. The force begins {t[on] - entry:.2f} ms after the surface is crossed and ends "
+        f"{t[off] - leave:.2f} ms after it is crossed again: a sample is up to one period late, "
+        f"and its force takes effect a SYNC later.",
+        {"t [ms]": t, "y [mrad]": y, "-f/K held [mrad]": held},
+        figure,
+    )
+
+
+def draw_four_strikes(recorded: RecordedRun) -> Iterator[FigurePage]:
+    """Draw figures 5.18 and 5.19 from one run."""
     yield _draw_strikes(recorded)
     yield _draw_efforts(recorded)
 
 
-def close_up(recorded: RecordedRun) -> slice:
-    """Return the cycles of the close-up: the second and third contact of the first strike."""
+def contacts_of_first_strike(recorded: RecordedRun) -> list[slice]:
+    """Return the contacts of the first strike as slices of cycles."""
     strike = recorded.summary["strikes"][0]
     start, end = (round(strike[k] / recorded.settings.bus.cycle_s) for k in ("start_s", "end_s"))
     y, force = recorded.column("y")[start:end], recorded.column("force_applied")[start:end]
-    contacts = metrics.contacts(y, force)[_CLOSE_UP]
-    return slice(start + contacts[0].start - _AROUND, start + contacts[-1].stop + _AROUND)
+    return [slice(start + c.start, start + c.stop) for c in metrics.contacts(y, force)]
+
+
+def close_up(recorded: RecordedRun) -> slice:
+    """Return the cycles of the close-up: the second and third contact of the first strike."""
+    contacts = contacts_of_first_strike(recorded)[_CLOSE_UP]
+    return slice(contacts[0].start - _AROUND, contacts[-1].stop + _AROUND)
 
 
 def effort(recorded: RecordedRun, wall: Wall) -> Array:
@@ -138,13 +189,9 @@ def effort_crossing_phases(t: Array, y: Array, level: Array) -> tuple[Array, int
 
 def _draw_strikes(recorded: RecordedRun) -> FigurePage:
     title = "Figure 5.18: four strikes of a virtual wall, with two controllers"
-    figure, axes = blank(title, "time t [s]", "", (11.0, 4.8))
+    figure, axes = blank(f"{title} (grey: inside)", "time t [s]", "", (PAGE_IN, 3.6))
     strikes = recorded.summary["strikes"]
-    laws = list(dict.fromkeys(strike["law"] for strike in strikes))
-    draw_strikes(axes, recorded.signals, strikes, dict(zip(laws, COLOURS, strict=False)))
-    axes.set_title(f"{title} (grey: inside)")
-    axes.tick_params(labelbottom=True)
-    axes.margins(x=0.01)
+    draw_strikes(axes, recorded.signals, strikes, law_colours(strikes))
     t, y = recorded.column("t_s"), recorded.column("y")
     box = close_up(recorded)
     low, high = y[box].min() * 1e3, y[box].max() * 1e3
@@ -154,7 +201,7 @@ def _draw_strikes(recorded: RecordedRun) -> FigurePage:
             np.ptp(t[box]),
             high - low + 10.0,
             fill=False,
-            color=COLOURS[2],
+            color=ACCENT,
             lw=2.0,
             zorder=3,
         )
@@ -196,11 +243,13 @@ def _draw_efforts(recorded: RecordedRun) -> FigurePage:
     applied = 0.0 - recorded.column("force_applied")[box] / stiffness * 1e3
     hidden = 0.0 - effort(recorded, other)[box] / stiffness * 1e3
     title = "Figure 5.19: close-up, with the effort of both controllers"
-    figure, axes = blank(title, "time t [s]", "position y, control effort as −f/K [mrad]")
-    axes.axhline(0.0, color="k", lw=0.8)
+    figure, axes = blank(title, "time t [s]", "position y, −f/K [mrad]")
+    axes.axhline(0.0, color="0.6", lw=0.8)
     axes.plot(t, y, ".-", color=REFERENT, lw=0.9, ms=4.0, label="position y")
-    stairs(axes, t, applied, f"{displayed.law}, displayed")
-    stairs(axes, t, hidden, f"{other.law}, not displayed", color=COLOURS[1], ls="--")
+    colours = law_colours(recorded.summary["strikes"])
+    stairs(axes, t, applied, f"{displayed.law}, displayed", color=colours[displayed.law])
+    label = f"{other.law}, not displayed"
+    stairs(axes, t, hidden, label, color=colours[other.law], ls="--")
     axes.margins(x=0.01)
     legend_below(figure, axes)
     phases, periods = effort_crossing_phases(t, y, hidden)

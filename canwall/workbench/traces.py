@@ -23,7 +23,7 @@ SHORT_S = 45.0
 POINTS = 20
 
 #: Labels of the axes.
-TIME, POSITION = "time t [s]", "height y, held force as −f/K [m]"
+TIME, POSITION = "time t [s]", "height y, −f/K [m]"
 
 
 def drop_ball(law: str, seconds: float = SHORT_S, height: float = BALL.height) -> Bounces:
@@ -68,7 +68,7 @@ class Traces:
 
     def draw(self, axes: Axes, samples: bool) -> None:
         """Draw referent, rendered motion and force, with the samples if asked for."""
-        axes.axhline(0.0, color="k", lw=0.8)
+        axes.axhline(0.0, color="0.6", lw=0.8)
         axes.plot(self.t, self.y, color=RENDERED, lw=2.4, label="sampled-data floor")
         # Dashed over solid, so that both are visible where they agree.
         axes.plot(self.t, self.referent, color=REFERENT, lw=1.0, ls="--", label="continuous floor")

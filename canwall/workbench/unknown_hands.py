@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from canwall import config
 from canwall.analysis import AskedWall
 from canwall.config import Settings
-from canwall.figure_style import COLOURS
+from canwall.figure_style import COLOURS, DPI, PAGE_IN
 from canwall.record import Phase
 from canwall.run.closed_loop import simulate
 from canwall.run.referent import referent_motion
@@ -27,7 +27,7 @@ _STIFFNESS, _SPEED = 300.0, 0.7
 _BEFORE, _AFTER = 20, 140
 #: Positions that are shown [mrad].
 _SHOWN = (-9.0, 9.0)
-_POSITION, _IN_FORCE, _MASS = COLOURS[5], COLOURS[0], COLOURS[2]
+_POSITION, _IN_FORCE, _MASS = COLOURS[4], COLOURS[0], COLOURS[3]
 
 
 class OperatorStrike(NamedTuple):
@@ -84,9 +84,9 @@ def _struck_by(operator: str) -> Settings:
 
 def draw_unknown_hands() -> Iterator[FigurePage]:
     """Draw a strike by each operator, with what the cycle has found of it."""
-    title = f"A strike by six operators on one wall, {_STIFFNESS:g} N·m/rad asked"
-    figure = Figure(figsize=(12.0, 9.0), layout="constrained", dpi=120)
-    figure.suptitle(title)
+    title = f"A strike by six operators, {_STIFFNESS:g} N·m/rad asked (inertia with the handle)"
+    figure = Figure(figsize=(PAGE_IN, 8.0), layout="constrained", dpi=DPI)
+    figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     grid = figure.add_gridspec(2, 3)
     t = np.arange(-_BEFORE, _AFTER, dtype=np.float64)
     columns: dict[str, Array] = {"t from contact [ms]": t}
@@ -104,7 +104,7 @@ def draw_unknown_hands() -> Iterator[FigurePage]:
         )
     handles, labels = figure.axes[0].get_legend_handles_labels()
     more = figure.axes[1].get_legend_handles_labels()
-    figure.legend([*handles, *more[0]], [*labels, *more[1]], loc="outside lower center", ncols=5)
+    figure.legend([*handles, *more[0]], [*labels, *more[1]], loc="outside lower center", ncols=4)
     yield FigurePage(
         "unknown_hands",
         title,
@@ -128,12 +128,24 @@ def _draw_strike(
     above.plot(t, strike.referent * 1e3, "--", color=REFERENT, lw=1.0, label="continuous wall")
     above.axhline(0.0, color="k", lw=0.8)
     above.set_ylim(*_SHOWN)
-    above.set_title(f"{name}, {1e3 * strike.true_mass:.3g} g·m² with the handle")
+    above.set_title(f"{name}, {1e3 * strike.true_mass:.3g} g·m²")
     above.set_ylabel("y [mrad]")
     above.tick_params(labelbottom=False)
-    below.plot(t, strike.mass / strike.true_mass, color=_MASS, lw=1.4, label="mass ÷ true mass")
     below.plot(
-        t, strike.stiffness / _STIFFNESS, color=_IN_FORCE, lw=1.4, label="K in force ÷ K asked"
+        t,
+        strike.mass / strike.true_mass,
+        color=_MASS,
+        lw=1.6,
+        ls=(0, (3, 1, 1, 1)),
+        label="mass ÷ true mass",
+    )
+    below.plot(
+        t,
+        strike.stiffness / _STIFFNESS,
+        color=_IN_FORCE,
+        lw=1.4,
+        ls=(0, (5, 2)),
+        label="K in force ÷ K asked",
     )
     below.axhline(1.0, color="k", lw=0.8)
     below.set_ylim(0.0, 1.5)

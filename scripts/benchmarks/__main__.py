@@ -11,10 +11,12 @@ import sys
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
+from beside_the_panel import panel_beside
 from on_the_ball import ball, law_steps, planning_steps
 from on_the_bus import exchange, simulated_drive, whole_loop
 from on_the_clock import several_drives, sync_jitter
 from on_the_drive import endurance
+from on_the_panel import panel_hour
 from on_the_socket import full_cycles, round_trip, round_trip_on_vcan0, under_python
 from on_the_sweep import closed_loop, safeguards, sweep_on_two_cores, unknown_hand
 from ways_out import ways_out
@@ -40,10 +42,12 @@ BENCHMARKS: dict[str, Benchmark] = {
 }
 ON_REQUEST: dict[str, Benchmark] = {
     "endurance": endurance,
+    "panel_beside": panel_beside,
+    "panel_hour": panel_hour,
     "ways_out": ways_out,
     "round_trip_on_vcan0": round_trip_on_vcan0,
 }
-"""Minutes each, or in need of SocketCAN, so they are run when they are named."""
+"""Long, or in need of SocketCAN or much memory, so they are run when they are named."""
 
 
 def main() -> None:

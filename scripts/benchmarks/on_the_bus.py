@@ -108,7 +108,7 @@ class _EnabledDrive:
     """An enabled drive, and a wall to be rendered on it."""
 
     bus: StopwatchBus
-    drive: simdrive.SimulatedDrive
+    drive: simdrive.ServoDrive
     runner: simdrive.BusRunner
     link: Link
     axis: WallAxis

@@ -42,7 +42,7 @@ def endurance() -> dict[str, Any]:
     }
 
 
-def _enable(drive: simdrive.SimulatedDrive) -> None:
+def _enable(drive: simdrive.ServoDrive) -> None:
     def write(index: int, subindex: int, value: int, size: int) -> None:
         head = 0x23 | (4 - size) << 2
         frames = drive.process(_SDO, struct.pack("<BHBL", head, index, subindex, value))
@@ -70,7 +70,7 @@ def _enable(drive: simdrive.SimulatedDrive) -> None:
         write(0x6040, 0, controlword, 2)
 
 
-def _live(drive: simdrive.SimulatedDrive, cycles: int, period_s: float) -> None:
+def _live(drive: simdrive.ServoDrive, cycles: int, period_s: float) -> None:
     process, tick = drive.process, drive.tick
     rpdos = [struct.pack("<Hh", 0x0F, torque) for torque in (_TORQUE_PER_MILLE, -_TORQUE_PER_MILLE)]
     for cycle in range(cycles):

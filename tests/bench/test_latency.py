@@ -3,16 +3,19 @@
 import csv
 import json
 import math
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from colour_vision import assert_nothing_overlaps, assert_readable, assert_told_apart
 from commands import COMMAND, Start, command, config_file, wait_for
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 from rig import eds_with
 
-import canwall.run
 from canwall import config, simdrive
 from canwall.bench import latency as latency_module
 from canwall.bench.budget import Budget, BudgetFrame, bus_budget
@@ -22,7 +25,7 @@ from canwall.config import Settings
 from canwall.cycle import HISTOGRAM, Grant, observe_ns
 from canwall.drive import DriveError
 from canwall.errors import InputError, RunFailedError
-from canwall.run import StopRequest
+from canwall.run import StopRequest, buses
 
 REAL_TIME = {"bus.interface": "socketcan", "bus.channel": "can0"}
 READ_ONLY = 0x06010002.to_bytes(4, "little")
@@ -33,14 +36,14 @@ GRANTED = {"scheduling": Grant("SCHED_FIFO, priority 45")}
 def drives(monkeypatch: pytest.MonkeyPatch) -> "list[Listening]":
     """Every simulated drive that is made, and what it has heard."""
     made: list[Listening] = []
-    make = canwall.run.make_simulated_drive
+    make = buses.make_simulated_drive
 
     def listened(settings: Settings) -> simdrive.FaultyDrive:
         drive = make(settings)
         made.append(Listening(drive))
         return drive
 
-    monkeypatch.setattr(canwall.run.buses, "make_simulated_drive", listened)
+    monkeypatch.setattr(buses, "make_simulated_drive", listened)
     monkeypatch.setattr(latency_module, "_SETTLING_S", 0.02)
     return made
 
@@ -301,7 +304,59 @@ def test_files(tmp_path: Path) -> None:
         for name in ("idle", "load"):
             of_it = [r for r in rows if (r["quantity"], r["phase"]) == (quantity, name)]
             assert sum(int(row["cycles"]) for row in of_it) == 4
-    assert imread(paths[2]).shape[:2] == (504, 1440)
+    assert imread(paths[2]).shape[1] == 1280
+
+
+@pytest.fixture
+def picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Latency], Figure]:
+    def draw(found: Latency) -> Figure:
+        drawn: list[Figure] = []
+        monkeypatch.setattr(Figure, "savefig", lambda self, path: drawn.append(self))
+        write_latency(found, tmp_path)
+        return drawn[0]
+
+    return draw
+
+
+def test_missed_tpdos_are_visible(picture: Callable[[Latency], Figure]) -> None:
+    found = measured()
+    nothing = np.zeros(1, HISTOGRAM)
+    load = replace(
+        found.phases[1],
+        cycles=3000,
+        missed_tpdo=3000,
+        late_rpdo=0,
+        tpdo_to_rpdo=Histogram.of(nothing),
+        sync_to_rpdo=Histogram.of(nothing),
+    )
+    figure = picture(replace(found, phases=(found.phases[0], load)))
+    missed = next(
+        axes for axes in figure.axes if axes.get_title("left") == "Missed and late frames"
+    )
+    assert "load: 3000 of 3000" in [text.get_text() for text in missed.texts]
+    assert max(bar.get_width() for bar in missed.patches) == 100.0
+    response = next(axes for axes in figure.axes if axes.get_title("left") == "TPDO → RPDO")
+    legend = response.get_legend()
+    assert legend is not None
+    assert legend.get_texts()[1].get_text() == "load: no cycle had one"
+
+
+def test_axes_say_that_they_are_logarithmic(picture: Callable[[Latency], Figure]) -> None:
+    figure = picture(measured())
+    for axes in figure.axes:
+        for scale, label in (
+            (axes.get_xscale(), axes.get_xlabel()),
+            (axes.get_yscale(), axes.get_ylabel()),
+        ):
+            assert (scale == "log") == ("logarithmic" in label)
+    assert_told_apart(figure)
+    assert_readable(figure)
+    assert_nothing_overlaps(figure)
+    # Legends lie below their axes, where no peak is.
+    for axes in figure.axes[:3]:
+        legend = axes.get_legend()
+        assert legend is not None
+        assert legend.get_window_extent().y1 < axes.get_window_extent().y0
 
 
 def test_folder_that_cannot_be_made(tmp_path: Path) -> None:

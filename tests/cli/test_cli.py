@@ -1,6 +1,7 @@
 """The commands: what they say, with which exit code, and that bad input touches nothing."""
 
 import contextlib
+import importlib
 import os
 import subprocess
 import sys
@@ -13,7 +14,6 @@ from can.interfaces.virtual import VirtualBus
 from commands import COMMAND, command, config_file
 from rig import eds_without
 
-import canwall.run
 from canwall import cli, config
 from canwall.errors import InputError, RunFailedError
 
@@ -104,7 +104,7 @@ def test_help_of_a_command(say: Say, name: str, words: list[str]) -> None:
     ("arguments", "line"),
     [
         (["--colour"], "No such option: --colour"),
-        (["run", "--stifness", "3"], "No such option: --stifness"),
+        (["run", "--stifness", "3"], "No such option: --stifness; did you mean --stiffness?"),
         (["walk"], "No such command 'walk'"),
         (["run", "--stiffness", "soft"], "Invalid value for '--stiffness'"),
         (["drive", "one.toml", "two.toml"], "Got unexpected extra argument"),
@@ -266,16 +266,16 @@ def test_drive_that_nothing_describes(say: Say, tmp_path: Path) -> None:
     [
         (RunFailedError("the drive is gone"), 1, "canwall: the drive is gone\n"),
         (can.CanOperationError("bus off"), 1, "canwall: bus off\n"),
-        (KeyboardInterrupt(), 130, ""),
+        (KeyboardInterrupt(), 130, "canwall: interrupted\n"),
     ],
 )
 def test_exit_codes(
     say: Say, monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int, err: str
 ) -> None:
-    def fail(*args: object) -> None:
+    def fail(*args: object, **kwargs: object) -> None:
         raise error
 
-    monkeypatch.setattr(canwall.run, "run_together", fail)
+    monkeypatch.setattr(importlib.import_module("canwall.run"), "run_together", fail)
     said = say("run")
     assert (said.code, said.err) == (code, err)
 
@@ -286,10 +286,10 @@ def test_what_is_not_in_order_after_an_error_is_told(
 ) -> None:
     error.add_note("not restored")
 
-    def fail(*args: object) -> None:
+    def fail(*args: object, **kwargs: object) -> None:
         raise error
 
-    monkeypatch.setattr(canwall.run, "run_together", fail)
+    monkeypatch.setattr(importlib.import_module("canwall.run"), "run_together", fail)
     said = say("run")
     assert (said.code, said.err) == (1, "canwall: gone\ncanwall: not restored\n")
 
@@ -297,10 +297,10 @@ def test_what_is_not_in_order_after_an_error_is_told(
 def test_what_is_wrong_in_a_program_is_not_hidden(
     say: Say, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(*args: object) -> None:
+    def fail(*args: object, **kwargs: object) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(canwall.run, "run_together", fail)
+    monkeypatch.setattr(importlib.import_module("canwall.run"), "run_together", fail)
     with pytest.raises(ZeroDivisionError):
         cli.guarded(lambda: cli.app(["run"], standalone_mode=False))
 

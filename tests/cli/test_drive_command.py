@@ -1,11 +1,17 @@
 """`canwall drive`: faults are told of, and time is real where it is asked for."""
 
+import contextlib
+import json
+import os
+import re
 import signal
+import subprocess
 from pathlib import Path
 
 import can
 import pytest
-from commands import COMMAND, PATIENCE_S, Start, config_file
+from commands import COMMAND, PATIENCE_S, Start, command, config_file
+from fork_server import ForkedPopen
 
 from canwall import config
 
@@ -54,3 +60,41 @@ def test_syncs_count_where_time_is_theirs(start: Start, tmp_path: Path, channel:
         assert drive.stdout.readline() == "SYNC 3: bus_off ends\n"
     drive.send_signal(signal.SIGTERM)
     assert drive.wait(PATIENCE_S) == 0
+
+
+@pytest.mark.slow
+def test_tells_that_it_is_ready(tmp_path: Path, channel: Path) -> None:
+    fault = 'kind = "silence"\nat_sync = 0\nduration_syncs = 1'
+    ours, its = os.pipe()
+    words = [COMMAND, "drive", str(drive_file(tmp_path, channel, fault)), "--json"]
+    with contextlib.ExitStack() as stack:
+        ready = stack.enter_context(os.fdopen(ours))
+        drive = ForkedPopen[str](
+            [*words, "--ready-fd", str(its)], stdout=subprocess.PIPE, text=True, pass_fds=[its]
+        )
+        stack.enter_context(drive)
+        stack.callback(drive.kill)
+        os.close(its)
+        assert ready.read() == "ready\n"  # to its end: the drive has closed it
+        assert drive.stdout is not None
+        assert json.loads(drive.stdout.readline()) == {
+            "event": "ready",
+            "node_id": 5,
+            "interface": "unixcan",
+            "channel": str(channel),
+            "eds": str(config.shipped("eds/canwall-drive.eds")),
+        }
+        master = stack.enter_context(can.Bus(interface="unixcan", channel=str(channel)))
+        master.send(can.Message(arbitration_id=0x080, is_extended_id=False))
+        told = json.loads(drive.stdout.readline())
+        assert told == {"event": "report", "text": "SYNC 0: silence begins"}
+        drive.send_signal(signal.SIGINT)
+        assert drive.wait(PATIENCE_S) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("descriptor", ["77", "-1"])
+def test_descriptor_that_is_not_open(tmp_path: Path, channel: Path, descriptor: str) -> None:
+    done = command("drive", drive_file(tmp_path, channel, 'kind = "sto"'), "--ready-fd", descriptor)
+    assert done.returncode == 2
+    assert re.fullmatch(rf"canwall: --ready-fd {descriptor}: .*\n", done.stderr)

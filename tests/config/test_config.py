@@ -11,7 +11,7 @@ import tomli_w
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from canwall.config import ConfigError, Settings, Wall, load, shipped
+from canwall.config import ConfigError, Guard, Operator, Settings, Wall, load, shipped
 from canwall.errors import InputError
 
 BOUNDED = settings(derandomize=True, deadline=None, max_examples=200)
@@ -72,7 +72,7 @@ def test_the_least_that_is_enough(loaded: Load) -> None:
     assert found.bus.cycle_s == 0.001
     assert found.drive.node_id == 5
     assert found.simulation is None
-    assert found.stages == [(0.0, Wall(), found.limits)]
+    assert found.stages == [(0.0, Wall(), found.limits, Guard(), Operator())]
 
 
 REFUSED: list[tuple[dict[str, object], str]] = [
@@ -164,6 +164,15 @@ REFUSED: list[tuple[dict[str, object], str]] = [
     ({"wall.alternate": "midpoint"}, "wall.alternate: has to be an array, not 'midpoint'"),
     ({"wall.divider": 0}, "wall.divider: has to be greater than or equal to 1, not 0"),
     ({"estimator.delay_cycles": 4}, "estimator.delay_cycles: has to be less than or equal to 3"),
+    (
+        {
+            "mechanics.shaft_hz": 300,
+            "mechanics.rotor_inertia_kg_m2": 1e-5,
+            "wall.cap": 0.8,
+            "schedule": [{"at_s": 1, "divider": 2}],
+        },
+        "wall.divider: has to be 1 with mechanics.shaft_hz and wall.cap",
+    ),
     ({"bus.sync": "none"}, "bus.sync: has to be 'produce' or 'external', not 'none'"),
     ({"limits.energy_j": 0}, "limits.energy_j: has to be greater than 0, not 0"),
     (

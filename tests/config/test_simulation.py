@@ -2,8 +2,9 @@
 
 import pytest
 from pydantic import ValidationError
+from rig import settings_with
 
-from canwall.config import Hand, Simulation
+from canwall.config import Hand, Mechanics, Settings, Simulation
 from canwall.simdrive import make_servo
 
 REAL = {
@@ -29,6 +30,28 @@ def test_ideal_is_one_thing_by_key_and_by_method() -> None:
     assert Simulation.model_validate(by_key.model_dump()) == by_key
 
 
+@pytest.mark.parametrize(
+    ("drive", "simulation", "expected"),
+    [
+        ({}, {}, (131072, 0.637)),
+        ({"counts_per_rev": 4096.0, "rated_torque_nm": 1.27}, {}, (4096, 1.27)),
+        ({"counts_per_rev": 4096.0}, {"counts_per_rev": 1000}, (1000, 0.637)),
+        ({"counts_per_rev": 2047.5}, {}, (131072, 0.637)),
+    ],
+)
+def test_scales_of_the_master_are_those_of_the_simulated_drive(
+    drive: dict[str, float], simulation: dict[str, float], expected: tuple[int, float]
+) -> None:
+    raw = settings_with().model_dump(mode="json", exclude_none=True)
+    for key in ("counts_per_rev", "rated_torque_nm"):
+        del raw["simulation"][key]
+    raw["drive"] |= drive
+    raw["simulation"] |= simulation
+    found = Settings.model_validate(raw).simulation
+    assert found is not None
+    assert (found.counts_per_rev, found.rated_torque_nm) == expected
+
+
 def test_stiction_goes_with_coulomb_where_it_is_not_given() -> None:
     assert Simulation(coulomb_nm=0.02).breakaway_nm == pytest.approx(0.03)
     assert Simulation(coulomb_nm=0.02, ideal=True).breakaway_nm == 0.02
@@ -41,3 +64,6 @@ def test_a_shaft_has_two_ends() -> None:
         Simulation(shaft_hz=400.0, rotor_inertia_kg_m2=2e-4)
     with pytest.raises(ValidationError, match="needs a rigid shaft, shaft_hz = 0"):
         Simulation(shaft_hz=400.0, hand=Hand(grip=False))
+    for rotor, said in ((None, "it is missing"), (2e-4, "not 0.0002")):
+        with pytest.raises(ValidationError, match=f"rotor_inertia_kg_m2: with shaft_hz .* {said}"):
+            Mechanics(inertia_kg_m2=1e-4, shaft_hz=400.0, rotor_inertia_kg_m2=rotor)

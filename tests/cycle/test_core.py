@@ -1,6 +1,8 @@
 """The core of the cycle alone: frames and times of the test's own, without a bus or a clock."""
 
 import weakref
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
@@ -13,11 +15,12 @@ from hypothesis import strategies as st
 from rig import settings_with
 
 from canwall.bus.raw_socket import CAN_RTR
-from canwall.cycle import Exchange, Transport, WallAxis, run_laws, start_at
+from canwall.cycle import Exchange, Transport, Trip, WallAxis, run_laws, start_at
 from canwall.cycle.core import SPIN_NS, Want, abandon, begin, next_deadline, proceed, take
 from canwall.drive import DriveNode, DriveSetup, Field, Link, PdoLayout, Watchdog
 from canwall.drive.watchdog import NO_WATCHDOG, ErrorControlFrame
 from canwall.record import Phase, Ring
+from canwall.record.controls import Controls
 from canwall.units import DriveUnits
 
 PERIOD_NS = 1_000_000
@@ -111,6 +114,37 @@ def _axis(node_id: int, watchdog: Watchdog, overflow: int, ring: Ring) -> WallAx
 @pytest.fixture
 def bench() -> Bench:
     return Bench()
+
+
+@pytest.mark.parametrize("received", [True, False])
+def test_stop_word_takes_the_torque_out_of_the_next_rpdo(received: bool) -> None:
+    """It is written after the SYNC, before the TPDO: nobody in Python is asked in between."""
+    bench = Bench()
+    (axis,) = bench.axes
+
+    def cycle(between: Callable[[], None]) -> tuple[Want, int]:
+        bench.begin(1000)
+        bench.proceed()
+        between()
+        if received:
+            want = bench.take(axis.setup.tpdo.cob_id, tpdo(-100))
+        else:
+            for _ in range(2):  # in simulated time there is a second look
+                bench.now_ns += 2_000_000_000
+                want = bench.proceed()
+        rpdos = [number for _, (can_id, _, number) in bench.frames if can_id == RPDO + 5]
+        return want, rpdos[-1]
+
+    with closing(Controls.create()) as controls:
+        axis.open_controls(controls)
+        if received:
+            want, rpdo = cycle(lambda: None)
+            assert want == Want.DRAIN  # the next cycle
+            assert rpdo >> 16 > 0
+            abandon(bench.core)
+        # The cycle ends, and no further one begins, for the loop to take the drive down.
+        assert cycle(controls.stop) == (Want.DONE, 0x0F)
+        assert axis.cycle["trip"][0] == Trip.STOPPED
 
 
 def test_cycle_is_sync_tpdo_rpdo(bench: Bench) -> None:

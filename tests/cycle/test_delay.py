@@ -1,12 +1,15 @@
 """The delay D: by the fit alone, and as the loop measures it on the simulated drive."""
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rig import Loop, RigFactory, settings_with
+from rig import SIM_CONFIG, Loop, RigFactory, settings_with
 
-from canwall.config import Mechanics
+from canwall import config
+from canwall.config import Mechanics, Settings
 from canwall.cycle.delay import Delay, agreed_delay, excitation, measured_delay
 from canwall.physics import zoh
 from canwall.record import Phase
@@ -124,6 +127,14 @@ def test_excitation_gives_the_handle_no_lasting_speed() -> None:
         assert np.cumsum(signs)[-1] == 0
 
 
+def with_hand_at_rest(settings: Settings) -> Settings:
+    """Let the first strike come after the measurement."""
+    assert settings.simulation is not None
+    at_rest = settings.simulation.hand.model_copy(update={"first_strike_s": 1.0})
+    simulation = settings.simulation.model_copy(update={"hand": at_rest})
+    return settings.model_copy(update={"simulation": simulation})
+
+
 @pytest.mark.parametrize("given", [0.0, 0.35, 1.0, 2.0])
 def test_loop_measures_the_delay_that_the_drive_was_given(
     make_rig: RigFactory, given: float
@@ -137,10 +148,7 @@ def test_loop_measures_the_delay_that_the_drive_was_given(
             "simulation.torque_delay_cycles": extra,
         }
     )
-    assert settings.simulation is not None
-    at_rest = settings.simulation.hand.model_copy(update={"first_strike_s": 1.0})
-    simulation = settings.simulation.model_copy(update={"hand": at_rest})
-    rig = make_rig(settings.model_copy(update={"simulation": simulation}))
+    rig = make_rig(with_hand_at_rest(settings))
     loop = Loop(rig)
     if asynchronous:
         rig.node.write(0x1400, 2, 255)
@@ -153,3 +161,33 @@ def test_loop_measures_the_delay_that_the_drive_was_given(
     measuring = rows[rows["phase"] == Phase.MEASURING]
     assert len(measuring) == 850
     assert np.ptp(measuring["position_rad"]) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("known", "law", "measures"),
+    [
+        ({}, "mean_force", True),
+        ({}, "standard", False),
+        ({"drive.current_bandwidth_hz": 1600.0}, "mean_force", False),
+        ({"estimator.delay_cycles": 1.4}, "mean_force", False),
+        ({"estimator.measure_delay": False}, "mean_force", False),
+        ({"drive.torque_pdo": "immediate"}, "standard", True),
+        ({"drive.torque_pdo": "immediate", "estimator.delay_cycles": 0.4}, "mean_force", False),
+    ],
+)
+def test_it_is_measured_where_nothing_tells_it(
+    make_rig: RigFactory, known: dict[str, object], law: str, measures: bool
+) -> None:
+    unknown = {"drive.current_bandwidth_hz": 0.0, "estimator.measure_delay": "auto"}
+    settings = config.load(SIM_CONFIG, {**unknown, "wall.law": law, **known})
+    settings = settings.model_copy(update={"schedule": ()})
+    assert Loop(make_rig(settings)).axis.measures_delay is measures
+
+
+def test_lag_of_a_servo_that_nothing_tells(make_rig: RigFactory) -> None:
+    unknown = {"drive.current_bandwidth_hz": 0.0, "drive.drive_cycle_s": 0.0}
+    settings = config.load(SIM_CONFIG, unknown)
+    loop = Loop(make_rig(with_hand_at_rest(settings)))
+    assert loop.run(870).trips == []
+    lag_s = 1.0 / (2.0 * math.pi * 1600.0)
+    assert loop.axis.delay == pytest.approx(1.0 + (0.00025 + lag_s) / PERIOD, abs=0.03)

@@ -21,7 +21,7 @@ from canwall.record import Phase
 #: The hand strikes from cycle 200 on; by this one it rests on the wall and presses until 800.
 PRESSING = 500
 EMCY = 0x085
-UP, DOWN = [0x00, 0x06, 0x07, 0x0F], [0x07, 0x06, 0x00]
+UP, DOWN = [0x00, 0x06, 0x07, 0x0F], [0x00]
 
 
 @pytest.fixture(autouse=True)
@@ -418,7 +418,7 @@ def test_drive_that_falls_silent(make_rig: RigFactory) -> None:
     assert torques[3:] == pytest.approx([held * (4 - i) / 5 for i in range(5)], abs=1.5)
     # It hears though it is not heard: quick stop, then down.
     assert rpdos[PRESSING + 8] == (0x02, 0)
-    assert all(rpdo == (0x07, 0) for rpdo in rpdos[PRESSING + 9 :])
+    assert all(rpdo == (0x00, 0) for rpdo in rpdos[PRESSING + 9 :])
     assert loop.rig.node.read(0x6041) & 0x6F in (0x40, 0x07)
 
 
@@ -552,7 +552,7 @@ def test_exception_of_the_program_itself_ends_in_order(make_rig: RigFactory) -> 
 
     with pytest.raises(ZeroDivisionError):
         loop.run(None, wrong)
-    assert steps([word for word, _ in loop.rig.rpdos()])[-3:] == DOWN
+    assert steps([word for word, _ in loop.rig.rpdos()])[-1:] == DOWN
     assert loop.rig.rpdos()[-1] == (0x00, 0)
     assert loop.rig.node.read(0x6041) & 0x6F == 0x40
 
@@ -620,16 +620,20 @@ def answering_late(loop: Loop, late: Callable[[int], bool]) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("ahead", [1, 1000])
 def test_late_rpdos_end_the_run(make_rig: RigFactory, ahead: int) -> None:
-    loop = Loop(make_rig(pressing({"limits.late_cycles": 30})), real_time=True)
-    loop.exchange.ahead = ahead
-    answering_late(loop, lambda j: j >= PRESSING)
-    outcome = loop.run(None)
+    # A machine that is late by itself may end a run before there is a torque: once more, then.
+    for _ in range(4):
+        loop = Loop(make_rig(pressing({"limits.late_cycles": 30})), real_time=True)
+        loop.exchange.ahead = ahead
+        answering_late(loop, lambda j: j >= PRESSING)
+        outcome = loop.run(None)
+        assert outcome.trip_cycle is not None
+        if outcome.trip_cycle > PRESSING:
+            break
     (trip,) = outcome.trips
     assert trip.endswith(
         ": RPDOs after the next SYNC for 30 cycles, limits.late_cycles = 30: the machine is too "
         "slow for bus.cycle_s"
     )
-    assert outcome.trip_cycle is not None
     # Of the cycles before some may have been late as well: the machine has other things to do.
     assert outcome.trip_cycle <= PRESSING + 30
     assert loop.axis.late_rpdo >= 30

@@ -60,7 +60,7 @@ def test_what_is_not_granted_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     monkeypatch.setattr(realtime.getpass, "getuser", lambda: "someone")
     with real_time_machine(processor=4095) as granted:
         assert granted["scheduling"].found == "no real-time priority"
-        assert granted["scheduling"].advice.endswith(": someone - rtprio 45")
+        assert granted["scheduling"].advice.endswith(": someone - rtprio 46")
         assert granted["memory"].advice.endswith(": someone - memlock unlimited")
         assert "No such file" in granted["wake_up"].found
         assert granted["wake_up"].advice == ""
@@ -111,7 +111,7 @@ with real_time_machine() as granted:
     )
     scheduling, memory = Grant(*granted["scheduling"]), Grant(*granted["memory"])
     assert scheduling.found == "no real-time priority"
-    assert scheduling.advice.endswith(" - rtprio 45")
+    assert scheduling.advice.endswith(" - rtprio 46")
     assert memory.found.startswith("not locked (")
     assert memory.advice.endswith(" - memlock unlimited")
 
@@ -128,7 +128,7 @@ def test_user_who_may_have_less_of_a_priority(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(realtime.resource, "getrlimit", lambda which: (20, 20))
     with real_time_priority() as granted:
         assert granted.found == "SCHED_FIFO, priority 20"
-        assert granted.advice.endswith(" - rtprio 45")
+        assert granted.advice.endswith(" - rtprio 46")
     assert taken == [20, os.sched_getparam(0).sched_priority]
 
 

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import signal
 import socket
 import time
 from collections.abc import Callable
@@ -9,13 +10,14 @@ from collections.abc import Callable
 import can
 import numpy as np
 import pytest
-from rig import RPDO1, TPDO1, Loop, RigFactory, settings_with
+from rig import RPDO1, SYNC, TPDO1, Loop, RigFactory, settings_with
 
 from canwall.bus.cycle_socket import CycleSocket
 from canwall.bus.socket_pair import SocketPairBus
 from canwall.config import Settings
 from canwall.cycle.sockets import SocketTransport
 from canwall.record import TIMING_COLUMNS, Phase
+from canwall.stopping import stop_on_signals
 
 PRESSING = 500
 
@@ -50,6 +52,30 @@ def test_trip_ends_many_cycles_at_once(make_rig: RigFactory) -> None:
     first, second = one.run(None), many.run(None)
     assert first.trips == second.trips
     assert first.trip_cycle == second.trip_cycle is not None
+
+
+def test_signal_ends_many_cycles_at_once(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(pressing()))
+    loop.exchange.ahead = 1000
+    process = loop.rig.tampering.process
+    with stop_on_signals() as stop:
+        stop.hold(loop.exchange.attend)
+
+        def raising(can_id: int, data: bytes) -> list[tuple[int, bytes]]:
+            if can_id == SYNC and int(loop.record["j"][0]) == PRESSING and not stop.count:
+                os.kill(os.getpid(), signal.SIGTERM)
+                while not stop.count:  # the handler's turn, in the main thread
+                    time.sleep(0.001)
+            return process(can_id, data)
+
+        loop.rig.tampering.process = raising  # type: ignore[method-assign]
+        outcome = loop.run(None, lambda j: stop())
+    assert outcome.interrupted
+    rows = loop.rows()
+    after = rows["torque_cmd_per_mille"][rows["j"] > PRESSING]
+    assert rows["torque_cmd_per_mille"][rows["j"] == PRESSING] != 0
+    assert np.all(after == 0)
+    assert len(after) < 10
 
 
 def test_frames_of_others_reach_the_network_between_many_cycles(make_rig: RigFactory) -> None:

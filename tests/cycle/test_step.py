@@ -664,3 +664,37 @@ def test_law_that_nobody_knows() -> None:
     wall = Wall()
     with pytest.raises(UnknownLawError):
         set_wall(wall.cycle, wall.settings.wall.model_copy(update={"law": "none"}), wall.laws)
+
+
+@pytest.mark.parametrize(
+    ("told", "adapt", "given", "modelled"),
+    [
+        (0.95, True, None, 1.05),
+        (0.95, False, None, 0.95),
+        (0.95, False, 0.3, 1.25),
+        (1.0, True, 0.0, 1.0),
+        (2.95, True, None, 3.0),
+    ],
+)
+def test_model_has_a_margin_of_the_delay_and_what_acted_has_none(
+    told: float, adapt: bool, given: float | None, modelled: float
+) -> None:
+    keys = {"estimator.delay_cycles": told, "operator.adapt": adapt, "wall.law": "mean_force"}
+    if given is not None:
+        keys["estimator.delay_margin_cycles"] = given
+    wall = Wall(keys)
+    estimator = wall.cycle["estimator"][0, 0]
+    share = estimator["before"]["duration"] / wall.cycle["period"][0]
+    assert estimator["delay_periods"] + share == pytest.approx(modelled)
+    commanded, applied = [], []
+    for counts in (0, -4, -9, -12, -9, -4):
+        wall.at(counts)
+        commanded.append(wall.row["torque_cmd"][0])
+        applied.append(wall.row["torque_applied"][0])
+    assert len(set(commanded[1:])) > 3
+    whole = int(told)
+    rest = told - whole
+    for j in range(whole + 1, len(commanded)):
+        older = rest * commanded[j - whole - 1] if rest else 0.0
+        expected = older + (1.0 - rest) * commanded[j - whole]
+        assert applied[j] == pytest.approx(expected, rel=1e-9)

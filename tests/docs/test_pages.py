@@ -46,7 +46,7 @@ def exists(command_line: str) -> bool:
     if program != "canwall":
         return (ROOT / program).exists()
     command = COMMANDS
-    while hasattr(command, "commands") and words:
+    while hasattr(command, "commands") and words and not words[0].startswith("-"):
         if words[0] not in command.commands:
             return False
         command = command.commands[words.pop(0)]

@@ -102,8 +102,11 @@ def test_two_drives_are_named_at_the_set_up(twins: Rig) -> None:
 
 
 def test_doctor_names_two_drives(twins: Rig) -> None:
-    with pytest.raises(DriveError, match="two drives have node-ID 5"):
-        examine(twins.link, twins.settings, REQUIRED_OBJECTS, lambda step: None, Findings())
+    findings = Findings()
+    examine(twins.link, twins.settings, REQUIRED_OBJECTS, lambda step: None, findings)
+    (trouble,) = findings.troubles
+    assert trouble.found.startswith("two drives have node-ID 5")
+    assert trouble.do == "give one of them another node-ID"
 
 
 def test_boot_up_during_the_set_up(rig: Rig) -> None:

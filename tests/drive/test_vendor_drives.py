@@ -9,6 +9,7 @@ from commands import Record, command
 from rig import Loop, Rig, RigFactory
 
 from canwall import config
+from canwall.bench.soft_wall import soft_stiffness, soft_torque
 from canwall.config import Settings
 from canwall.drive import DriveError, set_up
 
@@ -52,6 +53,15 @@ def settings_of(drive: Drive, **overrides: object) -> Settings:
 @pytest.fixture
 def rig(drive: Drive, make_rig: RigFactory) -> Rig:
     return make_rig(settings_of(drive))
+
+
+def stiff() -> dict[str, object]:
+    """The wall of config/sim.toml in place of the soft one of the file."""
+    own = config.load(config.shipped("config/sim.toml"))
+    return {
+        "wall__stiffness_nm_per_rad": own.wall.stiffness_nm_per_rad,
+        "limits__torque_nm": own.limits.torque_nm,
+    }
 
 
 def sync(rig: Rig) -> None:
@@ -120,35 +130,37 @@ def test_torque_moves_the_handle_by_as_much(drive: Drive, make_rig: RigFactory) 
 
 def test_strikes_come_out_as_on_our_own_drive(drive: Drive, make_rig: RigFactory) -> None:
     own = Loop(make_rig(config.load(config.shipped("config/sim.toml"))))
-    theirs = Loop(make_rig(settings_of(drive)))
+    theirs = Loop(make_rig(settings_of(drive, **stiff())))
     for loop in (own, theirs):
         assert loop.run(700).trips == []
     ours, others = own.rows(), theirs.rows()
     if drive.name == "ingenia":  # its torque comes in other steps
-        assert others["position_rad"] == pytest.approx(ours["position_rad"], abs=2e-4)
+        assert others["position_rad"] == pytest.approx(ours["position_rad"], abs=5e-4)
         impulses = [np.cumsum(rows["torque_applied"]) * 1e-3 for rows in (ours, others)]
-        assert impulses[1] == pytest.approx(impulses[0], abs=1e-4)
+        assert impulses[1] == pytest.approx(impulses[0], abs=3e-3)
         return
     for column in ("position_rad", "torque_applied"):
         assert others[column] == pytest.approx(ours[column], abs=1e-9)
 
 
 def test_run(drive: Drive, tmp_path: Path) -> None:
-    """The four strikes through the command: the plain wall chatters, the default does not."""
-    done = command(
-        "run",
-        DRIVES / f"{drive.name}.toml",
-        "--eds",
-        EDS / drive.eds,
-        "--restore",
-        "--output",
-        tmp_path / "run",
-    )
+    """Four strikes through the command, by the name of the configuration: nothing chatters."""
+    eds, folder = EDS / drive.eds, tmp_path / "run"
+    done = command("run", drive.name, "--eds", eds, "--restore", "--output", folder)
     assert done.returncode == 0, done.stderr
-    strikes = Record(tmp_path / "run").summary["strikes"]
-    assert [strike["law"] for strike in strikes] == ["mean_force", "standard"] * 2
-    assert [strike["chatter"] for strike in strikes] == [False, True, False, True]
-    assert max(strikes[i]["contacts"] for i in (0, 2)) <= 2
+    assert "guard" not in done.stderr
+    strikes = Record(folder).summary["strikes"]
+    assert [strike["chatter"] for strike in strikes] == [False] * 4
+    assert max(strike["contacts"] for strike in strikes) <= 2
+
+
+def test_first_wall_is_soft_by_the_rule(drive: Drive) -> None:
+    settings = settings_of(drive)
+    mechanics, cycle_s = settings.mechanics, settings.bus.cycle_s
+    inertia, viscous = mechanics.inertia_kg_m2, mechanics.viscous_nm_s_per_rad
+    assert settings.wall.stiffness_nm_per_rad == soft_stiffness(inertia, viscous, cycle_s)
+    assert settings.limits.torque_nm == soft_torque(drive.rated_torque_nm)
+    assert settings.schedule == ()
 
 
 def test_maxon_counts_the_rated_torque_in_micro(make_rig: RigFactory) -> None:
@@ -166,7 +178,7 @@ def test_maxon_counts_the_rated_torque_in_micro(make_rig: RigFactory) -> None:
 def test_wall_that_ends_while_the_handle_turns(drive: Drive, make_rig: RigFactory) -> None:
     """No ramp of the drive's own turns the handle on."""
     ends_at = 690
-    loop = Loop(make_rig(settings_of(drive, wall__law="standard")))
+    loop = Loop(make_rig(settings_of(drive, wall__law="standard", **stiff())))
     outcome = loop.run(ends_at)
     position, period = loop.rows()["position_rad"], loop.rig.settings.bus.cycle_s
     assert abs(position[ends_at] - position[ends_at - 1]) / period > 1.0
@@ -179,8 +191,9 @@ def test_profile_torque(name: str, make_rig: RigFactory) -> None:
     drive = next(found for found in FOUND if found.name == name)
     if not (EDS / drive.eds).is_file():
         pytest.skip(f"{EDS} has no {drive.eds}")
-    cst = Loop(make_rig(settings_of(drive, wall__law="standard")))
-    pt = Loop(make_rig(settings_of(drive, wall__law="standard", drive__mode="pt")))
+    plain = stiff() | {"wall__law": "standard"}
+    cst = Loop(make_rig(settings_of(drive, **plain)))
+    pt = Loop(make_rig(settings_of(drive, **plain, drive__mode="pt")))
     for loop in (cst, pt):
         assert loop.run(700).trips == []
     assert pt.setup.mode is not None

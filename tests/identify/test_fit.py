@@ -1,6 +1,9 @@
 """Fit of a servo: against servos of its own integration, whose parameters are known."""
 
 import math
+import tomllib
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -8,16 +11,11 @@ from scipy.signal import lsim
 from servo_bench import Truth, free_settings, play
 from thirty_servos import AIMS, compared, error, identified
 
-from canwall.identify import UntellingDataError, fit_servo
+from canwall.identify import Identified, UntellingDataError, fit_servo, toml_fragment
+from canwall.identify.break_away import break_away
+from canwall.identify.estimates import Estimate
 from canwall.identify.excitation import Excitation
-from canwall.identify.fit import (
-    PIECE,
-    Estimate,
-    break_away,
-    encoder_step,
-    steady_pieces,
-    torque_response,
-)
+from canwall.identify.pieces import PIECE, encoder_step, steady_pieces, torque_response
 
 PERIOD = 1e-3
 COUNT = 2.0 * math.pi / 131072
@@ -111,6 +109,24 @@ def test_random_servo(seed: int) -> None:
         assert error(name, estimate, true) <= AIMS[name], name
         assert estimate.contains(true), name
     assert (fit.shaft is not None) == (truth.shaft_hz > 0.0)
+    found = SimpleNamespace(hand=None, servo=fit, measured=np.empty(0))
+    mechanics = tomllib.loads(toml_fragment(cast(Identified, found)))["mechanics"]
+    assert ("shaft_hz" in mechanics) == (truth.shaft_hz > 0.0)
+    if truth.shaft_hz:
+        assert mechanics["shaft_hz"] == pytest.approx(truth.shaft_hz, rel=0.05)
+        rotor = truth.rotor_part * mechanics["inertia_kg_m2"]
+        assert mechanics["rotor_inertia_kg_m2"] == pytest.approx(rotor, rel=0.1)
+
+
+@pytest.mark.slow
+def test_coarse_encoder_is_no_hand() -> None:
+    """A tenth of the rated torque moves the handle by few counts."""
+    settings, truth = free_settings(1.0e-4), Truth(counts=2048, coulomb=0.005)
+    position, torque = play(settings, truth, Excitation(settings, 0.063))
+    fit = fit_servo(position, torque, PERIOD, 2.0 * math.pi / truth.counts)
+    assert fit.residuals.explained < 0.98
+    assert fit.inertia.contains(truth.inertia)
+    assert fit.inertia.value == pytest.approx(truth.inertia, rel=0.02)
 
 
 @pytest.mark.slow

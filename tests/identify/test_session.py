@@ -3,7 +3,10 @@
 import json
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
+import numpy as np
 import pytest
 from commands import command, config_file
 from rig import eds_with, settings_with
@@ -12,6 +15,8 @@ from canwall.config import Settings
 from canwall.errors import ConfigError
 from canwall.identify import identify
 from canwall.identify.excitation import Bounds, HandExcitation
+from canwall.identify.session import Identification
+from canwall.record import ROW
 
 #: Changes of config/sim.toml: nobody at the handle, a real current loop, a model that is off.
 FREE = {
@@ -113,6 +118,36 @@ def test_stopped_on_the_way(tmp_path: Path) -> None:
     assert (outcome.interrupted, outcome.disabled, outcome.trips) == (True, True, [])
     assert found.servo is None
     assert found.result.summary["interrupted"]
+
+
+@pytest.mark.parametrize(
+    ("synchronous", "torques"),
+    [(True, [1.0, 1.0, 1.0, 1.0, 2.0, 3.0]), (False, [1, 2, 2, 2, 2, 3])],
+)
+def test_master_that_stands_still_has_no_fast_handle(
+    synchronous: bool, torques: list[float]
+) -> None:
+    """Three SYNCs are left out, in which the torque in force stays and the handle goes on."""
+    row = np.zeros(1, ROW)
+    row["received"] = True
+    cycle: Any = {"skipped_sync": np.zeros(1, int), "nm_per_mille": np.full(1, 1e-3)}
+    cycle |= {"test_per_mille": np.zeros(1, int), "rad_per_count": np.full(1, 1e-3)}
+    settings = SimpleNamespace(bus=SimpleNamespace(cycle_s=1e-3))
+    setup = SimpleNamespace(synchronous=synchronous)
+    asked: list[tuple[float, int]] = []
+    excitation = SimpleNamespace(next=lambda *given: asked.append(given))
+    axis: Any = SimpleNamespace(row=row, cycle=cycle, settings=settings, setup=setup)
+    identification = Identification(axis, cast(Any, excitation))
+    for position, torque in ((0.0, 1.0), (0.01, 2.0), (0.05, 3.0)):
+        identification.excite()
+        cycle["skipped_sync"] += 3 if position == 0.05 else 0
+        row["position_rad"], row["counts"], row["torque_cmd"] = position, 1e3 * position, torque
+        identification.note()
+    identification.excite()
+    assert asked[2:] == [(0.01, 1), (0.05, 4)]
+    measured = identification.measured()
+    np.testing.assert_array_equal(measured.position, [0.0, 0.01, *[np.nan] * 3, 0.05])
+    assert measured.torque.tolist() == torques
 
 
 def test_handle_next_to_a_limit_is_refused() -> None:

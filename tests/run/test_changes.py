@@ -5,7 +5,7 @@ import re
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +21,14 @@ from commands import (
 )
 from rig import Loop, RigFactory, settings_with
 
-import canwall.run.changes
 from canwall import config
 from canwall.config import ConfigError, WallChange
 from canwall.cycle import Offer, Outcome, WallAxis, WallStage
 from canwall.errors import RunFailedError
-from canwall.record import Mailbox, RunFolder, read_signals
+from canwall.record import Mailbox, Ring, RunFolder, read_signals
+from canwall.record.live import LiveMemory
+from canwall.record.shared_memory import LiveAddresses, MemoryAddress
+from canwall.run import changes
 from canwall.run.changes import open_to_changes, post_change
 
 PATIENCE_S = 60.0
@@ -156,7 +158,7 @@ def test_change_is_in_force_from_the_cycle_that_it_is_told(
             wait_for(lambda: bool(loop.axis.offers))
         return False
 
-    with open_to_changes([loop.axis], [folder]):
+    with open_to_changes([loop.axis], [folder], loop.exchange, Outcome()):
         outcome = loop.run(1000, at)
     for sender in senders:
         sender.join()
@@ -192,6 +194,15 @@ def test_run_of_the_command_is_changed_by_the_command(start: Start, tmp_path: Pa
     stiffness = read_signals(folder / "signals.parquet")["stiffness"].to_numpy()
     assert stiffness[cycle] == 12.5
     assert stiffness[cycle - 1] == 2.0
+
+
+@contextmanager
+def live_memory(folder: RunFolder) -> Iterator[LiveMemory]:
+    """Yield the memory of a run that is written to a folder, without a run."""
+    folder.path.mkdir(exist_ok=True)
+    with closing(Ring.create()) as ring, closing(LiveMemory(ring)) as memory:
+        folder.write_live(memory.addresses)
+        yield memory
 
 
 class Bench:
@@ -232,7 +243,7 @@ class Bench:
                 requests[j]()
             return False
 
-        with open_to_changes([self.loop.axis], [self.folder]):
+        with open_to_changes([self.loop.axis], [self.folder], self.loop.exchange, Outcome()):
             outcome = self.loop.run(1000, at, **of_run)
         if self._sender is not None:
             self._sender.join()
@@ -278,7 +289,7 @@ def test_nothing_is_read_or_judged_in_the_loop(
 ) -> None:
     bench = Bench(make_rig, tmp_path, {})
     readers, judges, loops = set[int](), set[int](), set[int]()
-    text, judge = Mailbox.text, canwall.run.changes.judged
+    text, judge = Mailbox.text, changes.judged
 
     def noted_text(mailbox: Mailbox) -> str:
         readers.add(threading.get_ident())
@@ -293,7 +304,7 @@ def test_nothing_is_read_or_judged_in_the_loop(
         bench.ask("stiffness_nm_per_rad=20")
 
     monkeypatch.setattr(Mailbox, "text", noted_text)
-    monkeypatch.setattr(canwall.run.changes, "judged", noted_judged)
+    monkeypatch.setattr(changes, "judged", noted_judged)
     bench.run({300: ask})
     assert bench.answers == [300]
     assert readers == judges
@@ -331,7 +342,7 @@ def test_rubbish_in_the_mailbox_is_refused(make_rig: RigFactory, tmp_path: Path,
     refused: list[str] = []
 
     def post() -> None:
-        mailbox = Mailbox.open(bench.folder.read_live())
+        mailbox = Mailbox.open(bench.folder.read_live().mailbox)
         with pytest.raises(ConfigError) as error:
             mailbox.post(text, PATIENCE_S)
         refused.append(str(error.value))
@@ -345,7 +356,7 @@ def test_change_that_waits_at_the_end_of_the_run_is_refused(
     make_rig: RigFactory, tmp_path: Path
 ) -> None:
     bench = Bench(make_rig, tmp_path, {})
-    with open_to_changes([bench.loop.axis], [bench.folder]):
+    with open_to_changes([bench.loop.axis], [bench.folder], bench.loop.exchange, Outcome()):
         bench.ask("stiffness_nm_per_rad=20")
     wait_for(lambda: bool(bench.answers))
     assert bench.answers == ["the run has ended"]
@@ -368,70 +379,79 @@ def test_impossible_change_is_not_posted(
     tmp_path: Path, assignments: list[str], message: str
 ) -> None:
     folder = RunFolder(tmp_path)
-    mailbox = Mailbox.create()
-    folder.write_live(mailbox.address)
-    with pytest.raises(ConfigError) as error:
-        post_change(folder, assignments)
-    assert str(error.value).startswith(message)
-    assert not mailbox.waiting()
-    mailbox.close()
+    with live_memory(folder) as memory:
+        with pytest.raises(ConfigError) as error:
+            post_change(folder, assignments)
+        assert str(error.value).startswith(message)
+        assert not memory.mailbox.waiting()
 
 
 def test_run_that_is_over_takes_no_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = RunFolder(tmp_path)
     with pytest.raises(ConfigError, match="no run in progress"):
         post_change(folder, ["stiffness_nm_per_rad=1"])
-    mailbox = Mailbox.create()
-    folder.write_live(mailbox.address)
-    monkeypatch.setattr("canwall.run.changes._PATIENCE_S", 0.01)
+    monkeypatch.setattr(changes, "_PATIENCE_S", 0.01)
     monkeypatch.setattr("canwall.record.mailbox._LAST_ANSWER_S", 0.01)
-    with pytest.raises(RunFailedError, match="does not take the change"):
-        post_change(folder, ["stiffness_nm_per_rad=1"])
-    assert mailbox.withdrawn()
-    mailbox.close()
+    with live_memory(folder) as memory:
+        with pytest.raises(RunFailedError, match="does not take the change"):
+            post_change(folder, ["stiffness_nm_per_rad=1"])
+        assert memory.mailbox.withdrawn()
 
 
-def put_at(mailbox: Mailbox, path: Path) -> None:
-    """Put another file where the mailbox was, as another process with its number has it."""
+def put_at(address: MemoryAddress, path: Path) -> None:
+    """Put another file where a block of memory was, as another process with its number has it."""
     with path.open("rb+") as file:
-        os.dup2(file.fileno(), mailbox.address.descriptor)
+        os.dup2(file.fileno(), address.descriptor)
 
 
-def test_file_of_another_process_is_not_taken_for_the_mailbox(tmp_path: Path) -> None:
+@pytest.mark.parametrize("block", LiveAddresses._fields)
+def test_file_of_another_process_is_not_taken_for_the_memory(tmp_path: Path, block: str) -> None:
     folder, foreign = RunFolder(tmp_path), tmp_path / "thesis"
     foreign.write_bytes(bytes(10_000))
-    folder.config.write_text(settings_with().to_toml())
-    mailbox = Mailbox.create()
-    folder.write_live(mailbox.address)
-    put_at(mailbox, foreign)
-    with pytest.raises(ConfigError, match="no run in progress"):
-        post_change(folder, ["stiffness_nm_per_rad=1"])
-    # Nor is one that live.json names itself.
-    folder.write_live(mailbox.address._replace(file=str(foreign)))
-    with pytest.raises(ConfigError, match="no run in progress"):
-        post_change(folder, ["stiffness_nm_per_rad=1"])
-    mailbox.close()
+    with live_memory(folder) as memory:
+        addresses = memory.addresses
+        address = getattr(addresses, block)
+        kept = os.dup(address.descriptor)
+        put_at(address, foreign)
+        # Nor is one that live.json names itself.
+        for named in (address, address._replace(file=str(foreign))):
+            folder.write_live(addresses._replace(**{block: named}))
+            with pytest.raises(ConfigError, match="no run in progress"):
+                post_change(folder, ["stiffness_nm_per_rad=1"])
+        os.dup2(kept, address.descriptor)
+        os.close(kept)
     # The same number in the next run of the same process.
-    old = Mailbox.create()
-    folder.write_live(old.address)
-    old.close()
-    new = Mailbox.create()
-    assert new.address.descriptor == old._descriptor
-    with pytest.raises(ConfigError, match="no run in progress"):
+    folder.write_live(addresses)
+    with live_memory(RunFolder(tmp_path / "next")), pytest.raises(ConfigError, match="no run in"):
         post_change(folder, ["stiffness_nm_per_rad=1"])
-    new.close()
     assert foreign.read_bytes() == bytes(10_000)
+
+
+def test_nobody_can_cut_the_memory_off(tmp_path: Path) -> None:
+    with live_memory(RunFolder(tmp_path)) as memory:
+        for address in memory.addresses:
+            path = f"/proc/{address.pid}/fd/{address.descriptor}"
+            with open(path, "rb+", buffering=0) as file, pytest.raises(PermissionError):
+                file.truncate(0)
 
 
 @pytest.mark.parametrize(
     "text",
     [
         *("", "[]", "{}", "null", "5", '{"mailbox": "/proc/1/fd/1"}', "[" * 100_000, "\0"),
-        '{"pid": "1", "descriptor": 3, "file": "x"}',
-        '{"pid": 1, "descriptor": 3, "file": ["x"]}',
-        '{"pid": 1, "descriptor": 3, "file": "x", "more": 1}',
-        '{"pid": -1, "descriptor": 3, "file": "/memfd:canwall-mailbox-0 (deleted)"}',
-        '{"pid": true, "descriptor": 3, "file": "\\u0000"}',
+        '{"pid": 1, "descriptor": 3, "file": "x"}',
+        *(
+            "{" + ", ".join(f'"{block}": {address}' for block in LiveAddresses._fields) + "}"
+            for address in (
+                "1",
+                '{"pid": "1", "descriptor": 3, "file": "x"}',
+                '{"pid": 1, "descriptor": 3, "file": ["x"]}',
+                '{"pid": 1, "descriptor": 3, "file": "x", "more": 1}',
+                '{"pid": -1, "descriptor": 3, "file": "/memfd:canwall-mailbox-0 (deleted)"}',
+                '{"pid": true, "descriptor": 3, "file": "\\u0000"}',
+                '{"pid": 1, "descriptor": 3, "file": "/memfd:canwall-mailbox-\\u0000"}',
+            )
+        ),
     ],
 )
 def test_live_file_that_is_something_else(tmp_path: Path, text: str) -> None:

@@ -12,12 +12,12 @@ from canopen.profiles.p402 import State402
 from commands import Record, config_file
 from rig import IDEAL_CONFIG, SDO_REQUEST, SYNC
 
-import canwall.run.buses
 from canwall import cli, simdrive
 from canwall.config import Settings
 from canwall.cycle import exchange as exchange_module
 from canwall.faults import KINDS
 from canwall.record import Phase, Recorder
+from canwall.run import buses
 
 CASES = Path(__file__).with_name("fault_cases.txt")
 DOCUMENT = Path(__file__).parents[2] / "docs" / "ways_out.md"
@@ -91,14 +91,14 @@ class Witness:
 def witnesses(monkeypatch: pytest.MonkeyPatch) -> list[Witness]:
     """One witness for each simulated drive that is made."""
     found: list[Witness] = []
-    make = canwall.run.buses.make_simulated_drive
+    make = buses.make_simulated_drive
 
     def watched(settings: Settings) -> simdrive.FaultyDrive:
         drive = make(settings)
         found.append(Witness(drive))
         return drive
 
-    monkeypatch.setattr(canwall.run.buses, "make_simulated_drive", watched)
+    monkeypatch.setattr(buses, "make_simulated_drive", watched)
     monkeypatch.setattr(Recorder, "draw", lambda recorder, given_up: [])
     monkeypatch.setattr(exchange_module, "_SIMULATED_TIMEOUT_S", 0.02)
     monkeypatch.setattr(exchange_module, "_MISSING_TIMEOUT_S", 0.002)

@@ -17,10 +17,9 @@ def axis_after(action: str, alarms: int) -> Any:
     if alarms:
         cycle["guard"]["alarms"], cycle["guard"]["first_alarm"] = alarms, 280
         cycle["guard"]["lowest"] = 0.1 if action == "act" else 1.0
-    settings = SimpleNamespace(
-        guard=SimpleNamespace(action=action), bus=SimpleNamespace(cycle_s=1e-3)
-    )
-    return SimpleNamespace(cycle=cycle, settings=settings)
+    settings = SimpleNamespace(bus=SimpleNamespace(cycle_s=1e-3))
+    guard = SimpleNamespace(action=action)
+    return SimpleNamespace(cycle=cycle, settings=settings, guard=guard)
 
 
 @pytest.mark.parametrize("action", ["off", "warn", "act"])

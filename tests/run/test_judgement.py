@@ -130,7 +130,7 @@ def test_picture_has_mass_and_stiffness_in_force(
     )
     draw_run(tmp_path / "run.png", table, summary["strikes"])
     axes = {one.get_ylabel(): one for one in drawn[0].get_axes()}
-    asked, in_force = (line.get_ydata() for line in axes["K [N·m/rad]"].lines)
+    asked, in_force = (line.get_ydata() for line in axes["K\n[N·m/rad]"].lines)
     assert np.array_equal(np.asarray(asked), table["stiffness"].to_numpy())
     assert np.array_equal(np.asarray(in_force), table["stiffness_in_force"].to_numpy())
     (mass,) = axes["mass [g·m²]"].lines

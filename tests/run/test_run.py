@@ -19,6 +19,7 @@ from commands import (
     GUARD_SAID,
     ON_A_BUSY_MACHINE,
     PATIENCE_S,
+    STOPPED_SAID,
     Record,
     Start,
     command,
@@ -40,14 +41,13 @@ from rig import (
     settings_with,
 )
 
-import canwall.run.buses
-import canwall.run.running
 from canwall import config
 from canwall.cycle import make_cycle, run_laws, set_wall, step
 from canwall.cycle.state import start_at
 from canwall.drive import DriveSetup, Field, PdoLayout
 from canwall.errors import RunFailedError
 from canwall.record import ROW, Phase, Recorder
+from canwall.run import buses, run
 from canwall.units import DriveUnits
 
 UNIXCAN_CONFIG = config.shipped("config/unixcan.toml")
@@ -337,7 +337,7 @@ def assert_left_in_order(record: Record) -> None:
     ]
     words, torques = zip(*(struct.unpack("<Hh", rpdo) for rpdo in leaving), strict=True)
     assert set(torques) == {0}
-    assert list(dict.fromkeys(words)) == [0x07, 0x06, 0x00]
+    assert list(dict.fromkeys(words)) == [0x00]
     last, _ = record.cycles[-1]
     assert last is not None
     _, statusword, torque = struct.unpack("<iHh", last)
@@ -360,7 +360,7 @@ def test_ctrl_c_in_the_middle(start: Start, tmp_path: Path) -> None:
     running.send_signal(signal.SIGINT)
     _, errors = running.communicate(timeout=PATIENCE_S)
     assert running.returncode == 130
-    assert re.fullmatch(f"({GUARD_SAID})?", errors)
+    assert re.fullmatch(f"({GUARD_SAID})?{STOPPED_SAID}", errors)
     assert_left_in_order(Record(folder))
 
 
@@ -440,9 +440,9 @@ def test_bus_that_fails_before_the_first_cycle(
                 raise can.CanOperationError("transmit buffer full")
             super().send(msg, timeout)
 
-    monkeypatch.setattr(canwall.run.buses, "open_bus", lambda settings: NoSync("no sync"))
+    monkeypatch.setattr(buses, "open_bus", lambda settings: NoSync("no sync"))
     with pytest.raises(RunFailedError, match="the bus failed: transmit buffer full"):
-        canwall.run.run(settings_with({"bus.exchange": "python-can"}), tmp_path / "run")
+        run(settings_with({"bus.exchange": "python-can"}), tmp_path / "run")
 
 
 def test_record_that_is_lost(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -456,6 +456,4 @@ def test_record_that_is_lost(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) ->
     monkeypatch.setattr("canwall.record.recorder.Recorder", Lost)
     settings = settings_with({"run.duration_s": 0.3})
     with pytest.raises(RunFailedError, match="the writer of the record has died"):
-        canwall.run.run(
-            settings, tmp_path / "run", progress=lambda now, end: recorders[0]._writer.kill()
-        )
+        run(settings, tmp_path / "run", progress=lambda now, end: recorders[0]._writer.kill())

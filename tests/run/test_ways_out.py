@@ -14,11 +14,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import can
+import numpy as np
 import pytest
 from commands import (
     COMMAND,
     ON_A_BUSY_MACHINE,
     PATIENCE_S,
+    STOPPED_SAID,
     Record,
     Start,
     command,
@@ -27,11 +29,13 @@ from commands import (
     torque_is_on,
     wait_for,
 )
+from fork_server import PYTHON
 from rig import RPDO1, SDO_ANSWER, SDO_REQUEST, SYNC, Loop, RigFactory, eds_without, settings_with
 
 from canwall import config
-from canwall.record import Phase
+from canwall.record import Phase, RunFolder
 from canwall.record.folder import stream_of
+from canwall.record.live import LiveRun
 from canwall.run import stop_on_signals
 
 EMCY = 0x085
@@ -153,7 +157,7 @@ def test_signal_that_asks_for_the_end(
     with walled(start, tmp_path, exchange=exchange) as (master, witness, folder):
         master.send_signal(number)
         _, errors = master.communicate(timeout=PATIENCE_S)
-        assert (master.returncode, errors) == (130, "")
+        assert (master.returncode, errors) == (130, STOPPED_SAID)
         witness.assert_drive_gives_nothing()
         rpdos = [rpdo(data) for can_id, data in witness.frames if can_id == RPDO1]
     # From the first word of the way down on there is no torque.
@@ -200,8 +204,73 @@ def test_impatient_ctrl_c_while_the_drive_is_taken_down(make_rig: RigFactory) ->
     assert outcome.disabled
     assert outcome.trips == []
     words = [word for word, _ in loop.rig.rpdos()]
-    assert [word for word, _ in itertools.groupby(words)][-3:] == [0x07, 0x06, 0x00]
+    assert [word for word, _ in itertools.groupby(words)][-2:] == [0x0F, 0x00]
     assert loop.rig.node.read(0x6041) & 0x6F == 0x40
+
+
+# Another process stops it
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("exchange", ["native", "python-can"])
+def test_stop_word(start: Start, tmp_path: Path, exchange: str) -> None:
+    with walled(start, tmp_path, exchange=exchange) as (master, witness, folder):
+        with LiveRun.open(folder) as live:
+            live.stop()
+        _, errors = master.communicate(timeout=PATIENCE_S)
+        witness.assert_drive_gives_nothing()
+        assert witness.emergencies() == []
+    assert master.returncode == 1
+    # A witness that is slow loses frames, the master's own log has them all.
+    rpdos = [rpdo(data) for _, data in Record(folder).cycles]
+    (line,) = errors.splitlines()
+    assert line.endswith(": stopped from the panel")
+    # The wall's last RPDO has no torque, before the loop had to be asked.
+    leaving = next(k for k, (word, _) in enumerate(rpdos) if k and word < rpdos[k - 1][0])
+    assert [torque != 0 for _, torque in rpdos[leaving - 2 : leaving]] == [True, False]
+    assert {torque for _, torque in rpdos[leaving - 1 :]} == {0}
+    assert Record(folder).summary["trips"] == [line.removeprefix("canwall: ")]
+
+
+@pytest.mark.slow
+def test_panel_that_is_killed_in_the_contact(start: Start, tmp_path: Path) -> None:
+    """Its beats are watched, and missed."""
+    with walled(start, tmp_path) as (master, witness, folder):
+        panel = start(PYTHON, "-c", BEATS, folder)
+        assert panel.stdout is not None
+        assert panel.stdout.readline() == "watched\n", panel.communicate()[1]
+        panel.kill()
+        _, errors = master.communicate(timeout=PATIENCE_S)
+        witness.assert_drive_gives_nothing()
+        assert witness.emergencies() == []
+    assert master.returncode == 1
+    # A witness that is slow loses frames, the master's own log has them all.
+    rpdos = [rpdo(data) for _, data in Record(folder).cycles]
+    (line,) = errors.splitlines()
+    assert "no beat from the panel for" in line
+    assert "the wall was ramped down" in line
+    torques = np.array([torque for word, torque in rpdos if word == ENABLE_OPERATION])
+    held = np.abs(torques).max()
+    assert torques[-1] == 0
+    assert np.abs(np.diff(torques[-200:])).max() < 0.3 * held
+    assert [event["what"] for event in RunFolder(folder).read_events()] == [
+        "watch_beat",
+        "beat lost",
+    ]
+
+
+BEATS = """
+import sys, time
+from pathlib import Path
+from canwall.record.live import LiveRun
+
+live = LiveRun.open(Path(sys.argv[1]))
+live.request({"do": "watch_beat", "timeout_s": 2.0}, timeout_s=60.0)
+print("watched", flush=True)
+while True:
+    live.beat()
+    time.sleep(0.05)
+"""
 
 
 # The master is dead

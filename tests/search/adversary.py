@@ -27,7 +27,7 @@ from canwall.config import Settings
 from canwall.drive import DriveError, DriveState, state_of
 from canwall.errors import RunFailedError
 from canwall.record import Phase
-from canwall.simdrive import BusRunner, FaultyDrive, Frame, SimulatedDrive
+from canwall.simdrive import BusRunner, FaultyDrive, Frame, ServoDrive
 from canwall.simdrive.state import STATUSWORD, TORQUE
 
 Way: TypeAlias = Literal["received", "sent"]
@@ -221,7 +221,7 @@ class Duel(Rig):
         super().__init__(settings or duel_settings(), native=native)
         self.pass_time(0.01)  # the drive starts
 
-    def switch_on(self, drive: SimulatedDrive) -> BusRunner:
+    def switch_on(self, drive: ServoDrive) -> BusRunner:
         assert self.settings.simulation is not None
         device = cast(FaultyDrive, self.tampering.drive)
         self.adversary = Adversary(device, 3000)

@@ -18,13 +18,12 @@ from fuzzing import FoundError
 from rig import SIM_CONFIG
 from test_fault_matrix import Witness
 
-import canwall.run.buses
 from canwall import config, simdrive
 from canwall.config import Settings
 from canwall.cycle import exchange as exchange_module
 from canwall.errors import RunFailedError
 from canwall.record import Recorder
-from canwall.run import RunResult, run
+from canwall.run import RunResult, buses, run
 
 _STRIKES, _INTERVAL_S = 25, 0.2
 _DURATION_S = _STRIKES * _INTERVAL_S
@@ -125,7 +124,7 @@ def storms(
 def _watched() -> Iterator[list[Witness]]:
     """Have a witness at each simulated drive, and no pictures; give up what is lost sooner."""
     witnesses: list[Witness] = []
-    make = canwall.run.buses.make_simulated_drive
+    make = buses.make_simulated_drive
 
     def watched(settings: Settings) -> simdrive.FaultyDrive:
         drive = make(settings)
@@ -133,7 +132,7 @@ def _watched() -> Iterator[list[Witness]]:
         return drive
 
     with (
-        patch.object(canwall.run.buses, "make_simulated_drive", watched),
+        patch.object(buses, "make_simulated_drive", watched),
         patch.object(Recorder, "draw", lambda recorder, given_up: []),
         patch.object(exchange_module, "_SIMULATED_TIMEOUT_S", 0.02),
         patch.object(exchange_module, "_MISSING_TIMEOUT_S", 0.002),

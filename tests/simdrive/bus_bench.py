@@ -9,7 +9,7 @@ import canopen
 from can.interfaces.virtual import VirtualBus
 from simdrive_bench import EDS, NODE_ID, PERIOD_S, SYNC
 
-from canwall.simdrive import BusRunner, Dictionary, SimulatedDrive
+from canwall.simdrive import BusRunner, Dictionary, ServoDrive
 from canwall.simdrive.profile.hardware import Hardware
 
 RATED_NM = 0.637
@@ -64,7 +64,7 @@ class BusBench:
         self.flywheel = Flywheel()
         self._master, self._slave = VirtualBus(channel), VirtualBus(channel)
         dictionary = Dictionary.load(EDS, NODE_ID)
-        self.drive = SimulatedDrive(dictionary, NODE_ID, self.flywheel, PERIOD_S, hardware=hardware)
+        self.drive = ServoDrive(dictionary, NODE_ID, self.flywheel, PERIOD_S, hardware=hardware)
         self._runner = BusRunner(self.drive, self._slave, lambda: self.now_s)
         self.network = _Network(self, self._master)
         self.node = canopen.RemoteNode(NODE_ID, str(EDS))

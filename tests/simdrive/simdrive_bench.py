@@ -6,7 +6,7 @@ from pathlib import Path
 
 from canopen import SdoAbortedError
 
-from canwall.simdrive import Dictionary, Frame, SimulatedDrive
+from canwall.simdrive import Dictionary, Frame, ServoDrive
 from canwall.simdrive.communication.memory import Memory
 
 EDS = Path(__file__).parents[2] / "eds" / "canwall-drive.eds"
@@ -62,7 +62,7 @@ class Bench:
     def __init__(self, eds: Path = EDS, store: Path | None = None, node_id: int = NODE_ID) -> None:
         self.motion = RecordingMotion()
         dictionary = Dictionary.load(eds, node_id)
-        self.drive = SimulatedDrive(dictionary, node_id, self.motion, PERIOD_S, Memory(store))
+        self.drive = ServoDrive(dictionary, node_id, self.motion, PERIOD_S, Memory(store))
         self.sent = self.drive.boot()
         """Every frame that the drive has sent."""
 

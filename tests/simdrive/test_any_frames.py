@@ -36,7 +36,7 @@ from simdrive_bench import (
 )
 from vendors import OWN, path_of
 
-from canwall.simdrive import BusRunner, Dictionary, SimulatedDrive
+from canwall.simdrive import BusRunner, Dictionary, ServoDrive
 
 LSS_REQUEST, LSS_RESPONSE = 0x7E5, 0x7E4
 DICTIONARIES = (OWN, "technosoft_iPOS.D.v1.04.eds")
@@ -192,7 +192,7 @@ event_lists = st.lists(st.lists(event, max_size=10) | mutated(), max_size=8).map
 class WatchedMotion(RecordingMotion):
     """Notes every torque that is not zero, and what the drive said of its state meanwhile."""
 
-    drive: SimulatedDrive
+    drive: ServoDrive
 
     def advance(self, torque_nm: float, duration_s: float) -> None:
         if torque_nm:
@@ -208,7 +208,7 @@ class Fuzzed(Bench):
         self.motion = motion = WatchedMotion()
         dictionary = Dictionary.load(path, NODE_ID)
         dictionary.supply(0x6076, 0, 637)
-        self.drive = motion.drive = SimulatedDrive(dictionary, NODE_ID, motion, PERIOD_S)
+        self.drive = motion.drive = ServoDrive(dictionary, NODE_ID, motion, PERIOD_S)
         self.sent = self.drive.boot()
         self.tick()
         self.nmt(1)
@@ -335,7 +335,7 @@ def data_message(frame: Data) -> can.Message:
 )
 def test_runner_survives_whatever_is_on_the_bus(messages: list[can.Message]) -> None:
     with VirtualBus("any frames") as master, VirtualBus("any frames") as bus:
-        drive = SimulatedDrive(Dictionary.load(EDS, NODE_ID), NODE_ID, RecordingMotion(), PERIOD_S)
+        drive = ServoDrive(Dictionary.load(EDS, NODE_ID), NODE_ID, RecordingMotion(), PERIOD_S)
         runner = BusRunner(drive, bus)
         for message in messages:
             master.send(message)

@@ -13,7 +13,7 @@ from canopen.lss import LssError
 from canopen.profiles.p402 import BaseNode402
 from simdrive_bench import EDS, HEARTBEAT, NODE_ID, PERIOD_S, RecordingMotion
 
-from canwall.simdrive import BusRunner, Dictionary, SimulatedDrive
+from canwall.simdrive import BusRunner, Dictionary, ServoDrive
 
 WAIT_S = 10.0
 
@@ -48,7 +48,7 @@ def node(request: pytest.FixtureRequest, motion: RecordingMotion) -> Iterator[Ba
     node.TIMEOUT_SWITCH_OP_MODE = node.TIMEOUT_SWITCH_STATE_FINAL = WAIT_S
     node.TIMEOUT_SWITCH_STATE_SINGLE = WAIT_S
     bus = can.Bus(interface="virtual", channel=channel)
-    drive = SimulatedDrive(Dictionary.load(EDS, NODE_ID), NODE_ID, motion, PERIOD_S)
+    drive = ServoDrive(Dictionary.load(EDS, NODE_ID), NODE_ID, motion, PERIOD_S)
     runner = BusRunner(drive, bus)
     stop = threading.Event()
     thread = threading.Thread(target=runner.run, args=(stop.is_set,))
@@ -210,7 +210,7 @@ class Link:
         self.master = can.Bus(interface="virtual", channel=channel)
         self.bus = can.Bus(interface="virtual", channel=channel)
         dictionary = Dictionary.load(EDS, NODE_ID)
-        drive = SimulatedDrive(dictionary, NODE_ID, self.motion, PERIOD_S)
+        drive = ServoDrive(dictionary, NODE_ID, self.motion, PERIOD_S)
         self.runner = BusRunner(drive, self.bus)
 
     def send(

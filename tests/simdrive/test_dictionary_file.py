@@ -8,7 +8,7 @@ import pytest
 from simdrive_bench import EDS, NODE_ID, PERIOD_S, Bench, RecordingMotion
 
 from canwall.eds import DictionaryError
-from canwall.simdrive import Dictionary, SimulatedDrive
+from canwall.simdrive import Dictionary, ServoDrive
 
 
 def sections() -> RawConfigParser:
@@ -99,7 +99,7 @@ def edited(directory: Path, old: str, new: str) -> Path:
 def test_bad_file(tmp_path: Path, old: str, new: str, reason: str) -> None:
     path = edited(tmp_path, old, new)
     with pytest.raises(DictionaryError) as refused:
-        SimulatedDrive(Dictionary.load(path, NODE_ID), NODE_ID, RecordingMotion(), PERIOD_S)
+        ServoDrive(Dictionary.load(path, NODE_ID), NODE_ID, RecordingMotion(), PERIOD_S)
     message = str(refused.value)
     assert message.startswith(f"{path}: {reason}")
     assert "\n" not in message
@@ -140,10 +140,10 @@ def test_node_id_out_of_range(node_id: int) -> None:
 
 def test_drive_refuses_the_dictionary_of_another_node() -> None:
     with pytest.raises(ValueError, match="node-ID 6, but 5"):
-        SimulatedDrive(Dictionary.load(EDS, 5), 6, RecordingMotion(), PERIOD_S)
+        ServoDrive(Dictionary.load(EDS, 5), 6, RecordingMotion(), PERIOD_S)
 
 
 @pytest.mark.parametrize("period_s", [0.0, -0.001, float("nan")])
 def test_drive_refuses_a_period_that_is_none(period_s: float) -> None:
     with pytest.raises(ValueError, match="not positive"):
-        SimulatedDrive(Dictionary.load(EDS, 5), 5, RecordingMotion(), period_s)
+        ServoDrive(Dictionary.load(EDS, 5), 5, RecordingMotion(), period_s)

@@ -20,7 +20,7 @@ from simdrive_bench import (
     RecordingMotion,
 )
 
-from canwall.simdrive import Dictionary, SimulatedDrive
+from canwall.simdrive import Dictionary, ServoDrive
 
 MS = 0.001
 MASTER = 1
@@ -43,7 +43,7 @@ def test_boot_up(bench: Bench) -> None:
 
 def test_dead_before_boot() -> None:
     motion = RecordingMotion()
-    drive = SimulatedDrive(Dictionary.load(EDS, NODE_ID), NODE_ID, motion, PERIOD_S)
+    drive = ServoDrive(Dictionary.load(EDS, NODE_ID), NODE_ID, motion, PERIOD_S)
     assert drive.process(SDO_REQUEST, b"\x40\x00\x10\x00\x00\x00\x00\x00") == []
     assert drive.process(SYNC, b"") == []
     assert drive.process(0x000, b"\x01\x00") == []

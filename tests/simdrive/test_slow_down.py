@@ -11,7 +11,7 @@ from vendors import FOLDER, VENDORS, ConfiguredBench, path_of
 
 from canwall.config import Drive, Hand, Simulation
 from canwall.eds import DictionaryError
-from canwall.simdrive import Dictionary, SimulatedDrive, make_drive
+from canwall.simdrive import Dictionary, ServoDrive, make_drive
 
 STANDSTILL_RAD_S = 2.0 * math.pi / 60.0
 
@@ -112,7 +112,7 @@ def test_braking_along_the_voltage_limit_is_refused(tmp_path: Path) -> None:
     head, tail = text.split("[605A]", 1)
     path.write_text(head + "[605A]" + tail.replace("DefaultValue=2", "DefaultValue=4", 1))
     with pytest.raises(DictionaryError, match=r"0x605A:00 4: braking along the voltage limit"):
-        SimulatedDrive(Dictionary.load(path, NODE_ID), NODE_ID, BusBench().flywheel, PERIOD_S)
+        ServoDrive(Dictionary.load(path, NODE_ID), NODE_ID, BusBench().flywheel, PERIOD_S)
 
 
 def vendor_bench(file: str) -> ConfiguredBench:

@@ -23,7 +23,7 @@ from simdrive_bench import (
     Bench,
 )
 
-from canwall.simdrive import BusRunner, Dictionary, SimulatedDrive
+from canwall.simdrive import BusRunner, Dictionary, ServoDrive
 
 RATED_NM = 0.637
 INERTIA = 1e-4
@@ -79,7 +79,7 @@ class MassBench(Bench):
 
     def __post_init__(self) -> None:
         dictionary = Dictionary.load(EDS, NODE_ID)
-        self.drive = SimulatedDrive(
+        self.drive = ServoDrive(
             dictionary,
             NODE_ID,
             self.motion,

@@ -218,6 +218,13 @@ def test_a_file_that_is_no_journal_is_left_alone(tmp_path: Path) -> None:
     assert partial.read_text() == "a letter"
 
 
+@pytest.fixture
+def _quick_to_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have hundreds of journals not wait for the disk."""
+    monkeypatch.setattr(os, "fsync", lambda descriptor: None)
+
+
+@pytest.mark.usefixtures("_quick_to_disk")
 def test_a_journal_cut_short_by_a_power_cut_keeps_what_is_whole(tmp_path: Path) -> None:
     output = tmp_path / "a.nc"
     plan = plan_of(stiffness="1:100:3")
@@ -247,6 +254,7 @@ def some_pieces(count: int) -> list[np.ndarray[Any, Any]]:
     return [random.random(8).view([("force", "f8")]) for _ in range(count)]
 
 
+@pytest.mark.usefixtures("_quick_to_disk")
 def test_a_damaged_journal_is_never_read_as_data(tmp_path: Path) -> None:
     """Whatever happens to the file: a piece is what was put in, or it is not there."""
     output, pieces = tmp_path / "a.nc", some_pieces(12)
@@ -515,7 +523,7 @@ def test_a_wrong_axis(axes: dict[str, str], message: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        (["--axis", "colour=red"], "sweep axis colour: unknown key"),
+        (["--axis", "colour=red"], "sweep axis colour: unknown; known are law, stiffness"),
         (["--axis", "speed"], "--axis speed: has to be NAME=VALUES"),
         (["--through", "air"], "--through air: has to be sim or bus"),
         (["--workers", "2", "--dask", "nowhere"], "--workers and --dask: keep one"),

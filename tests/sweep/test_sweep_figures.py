@@ -7,6 +7,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 import xarray as xr
+from colour_vision import assert_nothing_overlaps, assert_readable, assert_told_apart
 from commands import command
 from matplotlib.figure import Figure
 from rig import settings_with
@@ -91,6 +92,15 @@ def test_a_map_has_a_panel_for_each_condition_and_the_limits_in_it(
         np.testing.assert_array_equal(shown, chatters.any(("speed", "phase")).squeeze())
         assert shown.any()
         assert not shown.all()
+
+
+@pytest.mark.slow
+def test_figures_are_readable_with_few_colours(z_width: Path, drawn: dict[str, Figure]) -> None:
+    write_sweep_figures(read_sweep(z_width), z_width.with_suffix(""))
+    for figure in drawn.values():
+        assert assert_told_apart(figure) > 0
+        assert_readable(figure)
+        assert_nothing_overlaps(figure)
 
 
 @pytest.mark.slow

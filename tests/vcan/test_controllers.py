@@ -63,8 +63,8 @@ def test_transmit_queue_that_is_full_for_a_moment(
     strikes_by: Callable[[str], Strikes],
     bench: Bench,
 ) -> None:
-    """Each SYNC comes upon the RPDO before it, which leaves after 5 ms: it is waited for."""
-    tc("qdisc", "add", "dev", controllers[1], "root", "netem", "delay", "5ms", "limit", "1")
+    """Each SYNC comes upon the RPDO before it, which leaves after 10 ms: it is waited for."""
+    tc("qdisc", "add", "dev", controllers[1], "root", "netem", "delay", "10ms", "limit", "1")
     try:
         record = _strike(bench, controllers, 0.3)
         queue = subprocess.run(
@@ -74,7 +74,7 @@ def test_transmit_queue_that_is_full_for_a_moment(
         )
     finally:
         tc("qdisc", "del", "dev", controllers[1], "root")
-    assert json.loads(queue.stdout)[0]["drops"] > 300, "the queue has been full"
+    assert json.loads(queue.stdout)[0]["drops"] > 100, "the queue has been full"
     on_vcan0 = strikes_by("native").record
     assert record.column("torque_cmd_per_mille").any()
     assert record.summary["missed_tpdo"] == 0

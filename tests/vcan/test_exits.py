@@ -4,7 +4,7 @@ import signal
 import struct
 
 import can
-from commands import Record
+from commands import STOPPED_SAID, Record
 from rig import RPDO1, TPDO1
 from socketcan import SLOW, UNTIL_STOPPED, Bench, is_disabled, run_with_torque, wait_for
 
@@ -23,7 +23,7 @@ def test_interrupted_run(bench: Bench) -> None:
     drive = bench.drive(configuration)
     folder = bench.folder / "run"
     run = run_with_torque(bench, folder, configuration)
-    assert (run.interrupt(), run.errors) == (130, [])
+    assert (run.interrupt(), run.errors) == (130, STOPPED_SAID.splitlines())
     record = Record(folder)
     assert record.summary["interrupted"]
     assert record.summary["trips"] == []

@@ -47,7 +47,7 @@ def test_interface_down_and_up(bench: Bench) -> None:
     bus = bench.bus()
     wait_for(lambda: is_disabled(bus))
     assert "the bus is gone" in drive.out
-    assert "the bus is back" in drive.out
+    wait_for(lambda: "the bus is back" in drive.out)
     again = bench.canwall("run", configuration, "--duration", 1, "--output", bench.folder / "2")
     assert (again.wait(), again.errors) == (0, [])
     assert drive.interrupt() == 0

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from rig import settings_with
+from scipy.linalg import solve_discrete_are
 from scipy.signal import cont2discrete
 
 from canwall.cycle.state import modelled_delay
@@ -92,16 +93,38 @@ def test_mass_is_found_within_samples_of_the_first_torque(mass: float) -> None:
     np.testing.assert_allclose(found[72:], mass, rtol=0.15)
 
 
-def test_state_is_that_of_the_matching_filter_alone() -> None:
+def walk_of(i: int) -> float:
+    """Equal bandwidths, q/m, up to 3 times the lightest mass; then they fall with m^-0.52."""
+    heavier = MASSES[i] / MASSES[0]
+    slower: float = max(1.0, heavier / 3.0) ** -0.52
+    return WALK * float(heavier) * slower**3
+
+
+@pytest.mark.parametrize("i", [3, 8])
+def test_state_is_that_of_the_matching_filter_alone(i: int) -> None:
     bank, estimator = bank_at(0.0)
-    play(bank, estimator, float(MASSES[8]), pulses(0.3))
+    bank["within"] = 0.0
+    play(bank, estimator, float(MASSES[i]), pulses(0.3))
     alone = np.zeros(1, ESTIMATOR)
-    walk = WALK * (MASSES[0] / MASSES[8]) ** 0.7
-    set_estimator(alone, MASSES[8], VISCOUS[8], 0.0, 0.0, PERIOD, COUNT, walk, DELAY)
+    set_estimator(alone, MASSES[i], VISCOUS[i], 0.0, 0.0, PERIOD, COUNT, walk_of(i), DELAY)
     reset_estimator(alone, 0.0)
-    play(None, alone, float(MASSES[8]), pulses(0.3))
-    np.testing.assert_allclose(bank["state"][0, :, 8], [alone[n][0] for n in "yvd"], rtol=1e-9)
-    np.testing.assert_allclose(bank["gain"][0, :, 8], alone["steady_gain"][0], rtol=1e-12)
+    play(None, alone, float(MASSES[i]), pulses(0.3))
+    np.testing.assert_allclose(bank["state"][0, :, i], [alone[n][0] for n in "yvd"], rtol=1e-9)
+    np.testing.assert_allclose(bank["gain"][0, :, i], alone["steady_gain"][0], rtol=1e-12)
+
+
+def test_reading_that_contradicts_nothing_leaves_a_heavy_hand_alone() -> None:
+    """Up to 0.4 counts for the heaviest, and nothing for those as light as a finger."""
+    bank, estimator = bank_at(0.0)
+    within = bank["within"][0, :16] / COUNT
+    assert np.all(within[MASSES <= 3e-4] == 0.0)
+    assert np.all(np.diff(within[MASSES > 3e-4]) > 0.0)
+    np.testing.assert_allclose(within[15], 0.4 * (1.0 - 3.0 / 45.0), rtol=1e-9)
+    gain = bank["gain"][0, 2, 15]
+    for off, corrected in ((0.3, 0.0), (-0.3, 0.0), (1.0, 1.0 - within[15])):
+        bank["state"] = 0.0
+        correct_bank(bank[0], estimator[0], off * COUNT)
+        np.testing.assert_allclose(bank["state"][0, 2, 15], gain * corrected * COUNT, atol=1e-15)
 
 
 def test_nothing_is_learned_in_free_motion_nor_at_rest() -> None:
@@ -133,3 +156,45 @@ def test_drive_cycle_and_lag_belong_to_the_delay() -> None:
     assert modelled_delay(settings_with({})) == 1.0
     expected = 1.0 + 0.25 + 1000.0 / (2.0 * np.pi * 1600.0)
     np.testing.assert_allclose(modelled_delay(settings_with(keys)), expected)
+
+
+def test_velocity_is_projected_with_the_covariance() -> None:
+    """E[x | v = w] = x + P·e/(eᵀ·P·e)·(w − v), e the velocity's unit vector, by SciPy's Riccati."""
+    bank, _ = bank_at(0.0)
+    for i in range(8):
+        phi, gamma = discrete(MASSES[i], VISCOUS[i], PERIOD)
+        a = np.eye(3)
+        a[:2, :2], a[:2, 2] = phi, gamma
+        walk = walk_of(i)
+        # In counts, counts per second and mN·m, for the solver's sake.
+        units = np.array([COUNT, COUNT / 1e-3, 1e-3])
+        a = a * units / units[:, None]
+        noise = np.diag([0.0, 0.0, PERIOD * (walk / units[2]) ** 2])
+        seen = np.array([[1.0, 0.0, 0.0]])
+        prior = solve_discrete_are(a.T, seen.T, noise, np.array([[1.0 / 12.0]]))
+        after = np.linalg.inv(np.linalg.inv(prior) + 12.0 * seen.T @ seen)
+        expected = after[[0, 2], 1] / after[1, 1] * units[[0, 2]] / units[1]
+        np.testing.assert_allclose(bank["with_velocity"][0, :, i], expected, rtol=1e-5)
+
+
+def test_handle_that_sticks_is_known_to_rest() -> None:
+    """A wall of 50 N·m/rad pushes it as the estimate says, which stiction holds."""
+    stiffness, damping = 50.0, 0.07
+
+    def pushed(bounded: bool) -> NDArray[np.float64]:
+        bank, estimator = bank_at(-20 * COUNT)
+        if not bounded:
+            bank["equal_samples"] = np.inf
+        bank["state"][0, 1] = estimator["v"] = 0.1  # it has just come to rest
+        forces = np.empty(100)
+        for j in range(len(forces)):
+            correct(estimator[0], -20 * COUNT)
+            correct_bank(bank[0], estimator[0], -20 * COUNT)
+            forces[j] = -stiffness * estimator["y"][0] - damping * estimator["v"][0]
+            predict_bank(bank[0], estimator[0], forces[j])
+            predict(estimator[0], forces[j])
+        return np.abs(forces - stiffness * 20 * COUNT)
+
+    # After 12 periods it is off by less than half a count, and would have been by three.
+    assert pushed(True)[12:].max() < 0.5 * stiffness * COUNT
+    assert pushed(False)[12:].max() > 3.0 * stiffness * COUNT

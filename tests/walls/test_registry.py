@@ -66,8 +66,15 @@ def test_deadbeat_is_an_option_of_some_laws(law: str) -> None:
 @pytest.mark.parametrize("name", ["Standard", "half-sample", "", "deadbeat"])
 @pytest.mark.parametrize("deadbeat", [False, True])
 def test_unknown_law(name: str, deadbeat: bool) -> None:
-    with pytest.raises(UnknownLawError, match=r"unknown law '.*'; known are standard, damped, "):
+    meant = "did you mean (standard|half_sample)"
+    with pytest.raises(UnknownLawError, match=rf"unknown law '.*'; (known are standard|{meant})"):
         find_law(name, deadbeat)
+
+
+@pytest.mark.parametrize(("name", "meant"), [("Standard", "standard"), ("rigd", "rigid")])
+def test_misspelt_law(name: str, meant: str) -> None:
+    with pytest.raises(UnknownLawError, match=f"unknown law '{name}'; did you mean {meant}"):
+        find_law(name)
 
 
 def test_options_have_defaults_and_names() -> None:

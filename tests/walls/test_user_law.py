@@ -108,7 +108,7 @@ def test_options_of_an_own_law(example: str) -> None:
     law = find_law(example)
     assert law.option_values({}) == [5.0]
     assert law.option_values({"growth": 0.5}) == [0.5]
-    with pytest.raises(UnknownLawError, match=r"my_law has no option 'grwth'; it has growth"):
+    with pytest.raises(UnknownLawError, match=r"my_law has no option 'grwth'; did you mean growth"):
         law.option_values({"grwth": 1.0})
 
 
@@ -195,7 +195,7 @@ def test_helpers_constants_memory_and_plain_integers(write: Write) -> None:
         ),
         (
             "def mine(wall):\n    return wall.options.growth\n",
-            "line 2: uses wall.options, but its file declares no OPTIONS",
+            "line 2: uses wall.options, but declares no OPTIONS",
         ),
         ("def mine(wall, y):\n    return y\n", "takes 2 arguments; a law takes one, the wall"),
         ("import math\nmath.nowhere\n", "AttributeError: module 'math' has no attribute 'nowhere'"),

@@ -487,7 +487,7 @@ def test_what_no_ball_can_be(name: str, wrong: float | str) -> None:
         replace(Ball(), **{name: wrong})  # type: ignore[arg-type]
     message = str(caught.value)
     assert message.startswith(f"{name} has to be ")
-    assert message.endswith(f"not {wrong!r}" if isinstance(wrong, str) else f"not {wrong:g}")
+    assert (f"not {wrong!r}" if isinstance(wrong, str) else f"not {wrong:g}") in message
     assert "\n" not in message
 
 

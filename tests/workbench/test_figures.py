@@ -11,8 +11,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from colour_vision import assert_nothing_overlaps, assert_readable, assert_told_apart
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+from scipy.signal import cont2discrete
 
 from canwall import cli
 from canwall.analysis import metrics
@@ -22,6 +26,8 @@ from canwall.workbench import CONTINUOUS, Ball, continuous_ball, on_the_drive, s
 from canwall.workbench import figures as figures_module
 from canwall.workbench.bounces import Bounces, entering
 from canwall.workbench.comparison import DAMPING, FORCELESS, GROUPS, continuous_result
+from canwall.workbench.designs import continuous_crossings
+from canwall.workbench.figure_page import FigurePage
 from canwall.workbench.figures import Extent, write_figures
 from canwall.workbench.on_the_drive import effort, record_run
 from canwall.workbench.traces import BALL, POINTS, drop_ball
@@ -29,8 +35,9 @@ from canwall.workbench.traces import BALL, POINTS, drop_ball
 Array = NDArray[np.float64]
 
 EXTENT = Extent(long_s=120.0, drops=4, phases=6, thetas=4, plane=3)
+DIAGRAMS = [f"figure_5_{n:02}" for n in (1, 2, 6, 7)]
 NAMES = [
-    *(f"figure_5_{n:02}" for n in (3, 4, 8, 9, 10, 11, 12, 14, 16, 17, 18, 19)),
+    *(f"figure_5_{n:02}" for n in (3, 4, 5, *range(8, 20))),
     "all_laws",
     "effective_impedance",
     "unknown_hands",
@@ -44,6 +51,7 @@ class Written:
 
     folder: Path
     index: str
+    figures: dict[str, Figure]
     steps: list[tuple[str, int, int]]
 
     def column(self, name: str, header: str) -> Array:
@@ -70,21 +78,46 @@ class Written:
 def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
     folder = tmp_path_factory.mktemp("figures") / "new" / "folder"
     steps: list[tuple[str, int, int]] = []
-    path = write_figures(folder, EXTENT, lambda *step: steps.append(step))
+    figures: dict[str, Figure] = {}
+    write = FigurePage.write
+
+    def noted(page: FigurePage, folder: Path) -> None:
+        figures[page.name] = page.figure
+        write(page, folder)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(FigurePage, "write", noted)
+        path = write_figures(folder, EXTENT, lambda *step: steps.append(step))
     assert path == folder / "index.md"
-    return Written(folder, path.read_text(encoding="utf-8"), steps)
+    return Written(folder, path.read_text(encoding="utf-8"), figures, steps)
 
 
 @pytest.mark.slow
 def test_every_figure_has_its_files_and_nothing_else_is_left(written: Written) -> None:
     expected = {f"{name}.{kind}" for name in NAMES for kind in ("png", "csv")} | {"index.md"}
+    expected |= {f"{name}.png" for name in DIAGRAMS}
     assert {path.name for path in written.folder.iterdir()} == expected
 
 
-@pytest.mark.parametrize("name", NAMES)
+def test_figures_are_in_the_order_of_the_chapter(written: Written) -> None:
+    numbered = [name for name in written.figures if name.startswith("figure_5_")]
+    assert numbered == [f"figure_5_{n:02}" for n in range(1, 20)]
+    assert re.findall(r"## Figure 5\.(\d+):", written.index) == [str(n) for n in range(1, 20)]
+
+
+@pytest.mark.parametrize("name", NAMES + DIAGRAMS)
+def test_they_are_readable_with_few_colours_and_in_a_column(written: Written, name: str) -> None:
+    figure = written.figures[name]
+    assert_told_apart(figure)
+    assert_readable(figure)
+    assert_nothing_overlaps(figure)
+
+
+@pytest.mark.parametrize("name", NAMES + DIAGRAMS)
 def test_pictures_show_something(written: Written, name: str) -> None:
     picture = imread(written.folder / f"{name}.png")
     assert min(picture.shape[:2]) >= 400
+    assert picture.shape[1] >= 700
     assert 0.01 < np.mean(picture[..., :3].min(axis=2) < 0.95) < 0.9
 
 
@@ -97,10 +130,10 @@ def test_columns_have_units_and_one_length(written: Written, name: str) -> None:
     assert {len(row) for row in rows} == {len(header)}
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", NAMES + DIAGRAMS)
 def test_index_tells_claim_and_finding(written: Written, name: str) -> None:
     section = next(s for s in written.index.split("\n## ") if f"({name}.png)" in s)
-    assert f"[data]({name}.csv)" in section
+    assert (f"[data]({name}.csv)" in section) == (name in NAMES)
     for part in (r"\*The chapter:\* (.{40,})", r"\*Here:\* (.{40,})"):
         assert re.search(part, section)
     assert not re.search(r"\bnan\b|\binf\b", section)
@@ -216,7 +249,62 @@ def test_heights_of_figure_5_12(written: Written) -> None:
     assert high == pytest.approx(100.0 * heights.max(), abs=0.05)
 
 
+def test_roots_of_figure_5_13(written: Written) -> None:
+    theta = written.column("figure_5_13", "theta [1]")
+    free = (np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]), np.eye(2), 0)
+    roots = {
+        law: written.column("figure_5_13", f"Re z {law} [1]")
+        + 1j * written.column("figure_5_13", f"Im z {law} [1]")
+        for law in ("standard", "half_sample", "pole_placement")
+    }
+    np.testing.assert_allclose(roots["pole_placement"], np.exp(1j * theta), atol=1e-9)
+    for at, *found in list(zip(theta, roots["standard"], roots["half_sample"], strict=True))[::10]:
+        # A free mass under a held force (SciPy); −K·y now, and half a period ahead on the spring.
+        a, b, *_ = cont2discrete(free, at)
+        gains = ([[1.0, 0.0]], [[math.cos(0.5 * at), math.sin(0.5 * at)]])
+        for k, z in zip(gains, found, strict=True):
+            assert np.abs(np.linalg.eigvals(a - b @ np.array(k)) - z).min() < 1e-9
+    standard = written.numbers("figure_5_13", r"standard ([\d.]+), ([\d.]+), ([\d.]+)")
+    assert standard == pytest.approx([math.sqrt(1 + x * x / 2) for x in (0.25, 1.0, 2.0)], abs=5e-5)
+
+
+def test_crossings_of_figure_5_15(written: Written) -> None:
+    entry, leave = continuous_crossings()
+
+    def fall(t: float, state: list[float]) -> list[float]:
+        return [state[1], max(-state[0], 0.0) - 1.0]
+
+    def surface(t: float, state: list[float]) -> float:
+        return state[0]
+
+    found = solve_ivp(fall, (0.0, 10.0), [12.0, 0.0], events=surface, rtol=1e-10, atol=1e-10)
+    assert found.t_events[0][:2] == pytest.approx([entry, leave], abs=1e-6)
+    m, n, before, after = written.numbers(
+        "figure_5_15", r"m = (\d+), n = (\d+).*Δt_a = ([\d.]+) s.*Δt_b = ([\d.]+) s"
+    )
+    assert ((m - 1) * 0.25 + before, n * 0.25 - after) == pytest.approx((entry, leave), abs=1e-4)
+    assert 0.0 < before < 0.25
+    assert 0.0 < after < 0.25
+
+
 # The run on the simulated drive
+
+
+def test_strip_chart_of_figure_5_5_is_the_first_contact(written: Written) -> None:
+    t, y = written.column("figure_5_05", "t [ms]"), written.column("figure_5_05", "y [mrad]")
+    whole_t = written.column("figure_5_18", "t [s]")
+    whole = written.column("figure_5_18", "y [mrad]")
+    start = int(np.flatnonzero(np.isclose(whole_t, t[0] * 1e-3))[0])
+    np.testing.assert_array_equal(y, whole[start : start + len(y)])
+    assert whole[:start].min() > 0.0
+    assert (y[0] > 0.0, y[-1] > 0.0, y.min() < 0.0) == (True, True, True)
+    # The force is that of the sample before, and so on and off a sample late.
+    held = written.column("figure_5_05", "-f/K held [mrad]")
+    half_step = 0.5 * 0.000637 / 50.0 * 1e3
+    np.testing.assert_allclose(held[1:], np.minimum(y[:-1], 0.0), rtol=0, atol=half_step + 1e-9)
+    on, off = written.numbers("figure_5_05", r"begins ([\d.]+) ms.*ends ([\d.]+) ms")
+    assert 1.0 < on < 2.0
+    assert 1.0 < off < 2.0
 
 
 def test_strikes_of_figure_5_18(written: Written) -> None:

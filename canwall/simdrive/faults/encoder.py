@@ -39,6 +39,11 @@ class FaultyEncoder:
         self.release()
 
     @property
+    def motion(self) -> Motion:
+        """The motion that it reads."""
+        return self._motion
+
+    @property
     def record(self) -> NDArray[np.void] | None:
         """Record of the motion (`RecordedMotion`); None while it is not read truly."""
         motion = self._motion

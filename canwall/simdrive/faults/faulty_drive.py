@@ -7,10 +7,11 @@ from random import Random
 from canwall.faults import POWER_ON, FaultKind, PlannedFault
 from canwall.frame import ERROR_FRAME, Frame
 from canwall.simdrive.communication.dictionary import Dictionary
-from canwall.simdrive.drive import SimulatedDrive
+from canwall.simdrive.drive import ServoDrive
 from canwall.simdrive.faults.encoder import FaultyEncoder
 from canwall.simdrive.faults.request import FaultRequest
 from canwall.simdrive.faults.wire import Wire
+from canwall.simdrive.profile.feedback import Motion
 
 
 class FaultyDrive:
@@ -22,7 +23,7 @@ class FaultyDrive:
 
     def __init__(
         self,
-        drive: SimulatedDrive,
+        drive: ServoDrive,
         encoder: FaultyEncoder,
         faults: Iterable[PlannedFault] = (),
         seed: int = 0,
@@ -52,6 +53,11 @@ class FaultyDrive:
         drive.extend(self._serve)
         for fault in faults:
             self._plan(fault)
+
+    @property
+    def motion(self) -> Motion:
+        """Motor, handle and hand, as they move whatever the encoder says."""
+        return self._encoder.motion
 
     @property
     def real_time(self) -> bool:
@@ -107,16 +113,33 @@ class FaultyDrive:
             self._settle()
         return frames
 
+    def begin(self, plan: PlannedFault) -> tuple[FaultKind, list[Frame]]:
+        """Begin a fault now, not with a SYNC; return it and the frames that the device sends."""
+        fault = self._plan(replace(plan, begin=self.now))
+        frames = self._turn(0.0)
+        if plan.periods == 0.0:  # before the first SYNC it would last until that
+            frames += self.end(fault)
+        self._settle()
+        return fault, frames
+
+    def end(self, fault: FaultKind) -> list[Frame]:
+        """End a fault now, if it is present; return the frames that the device sends."""
+        frames = self._end(fault) if fault in self._present else []
+        self._settle()
+        return frames
+
     def _serve(self, dictionary: Dictionary) -> None:
         self._request = FaultRequest(dictionary, self._requested, self._end_all)
         self._show()
 
-    def _plan(self, plan: PlannedFault) -> None:
+    def _plan(self, plan: PlannedFault) -> FaultKind:
         # Each fault has random numbers of its own, whatever other faults there are.
         random = Random(f"{self._seed} {self._count}")
-        self._waiting.append(plan.kind(plan, random, self.drive, self._encoder))
+        fault = plan.kind(plan, random, self.drive, self._encoder)
+        self._waiting.append(fault)
         self._count += 1
         self._settle()
+        return fault
 
     def _requested(self, plan: PlannedFault, syncs: int) -> None:
         self._plan(replace(plan, begin=self.now + 1.0 + syncs))

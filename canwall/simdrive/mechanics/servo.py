@@ -22,6 +22,7 @@ from canwall.physics import (
     advance_shaft,
     make_plant,
     make_shaft,
+    shaft_spring,
 )
 
 #: Plants: the handle alone, joined with the hand, and joined with it at the end of a shaft.
@@ -83,21 +84,19 @@ def hand_plant(simulation: Simulation) -> dict[str, float]:
 
 
 def elastic_shaft(simulation: Simulation) -> NDArray[np.void]:
-    """Return rotor, shaft, and handle with hand; shape (1,), dtype SHAFT.
-
-    Two masses on a spring resonate at √(k/μ), where μ is their reduced mass.
-    """
+    """Return rotor, shaft, and handle with hand; shape (1,), dtype SHAFT."""
     hand, rotor = simulation.hand, simulation.rotor_inertia_kg_m2
     handle = simulation.inertia_kg_m2 - rotor
-    reduced = rotor * handle / simulation.inertia_kg_m2
-    resonance = 2.0 * math.pi * simulation.shaft_hz
+    stiffness, damping = shaft_spring(
+        simulation.inertia_kg_m2, rotor, simulation.shaft_hz, simulation.shaft_damping_ratio
+    )
     return make_shaft(
         handle_plant(simulation) | {"mass": rotor},
         handle + hand.inertia_kg_m2,
         hand.damping_nm_s_per_rad,
         hand.stiffness_nm_per_rad,
-        stiffness=resonance**2 * reduced,
-        damping=2.0 * simulation.shaft_damping_ratio * resonance * reduced,
+        stiffness=stiffness,
+        damping=damping,
     )
 
 

@@ -1,0 +1,244 @@
+"""What programs of the command line have in common: help, version, completion, JSON, spelling."""
+
+import io
+import json
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+import xarray as xr
+from commands import PATIENCE_S, Record, command, config_file
+from rich.table import Table
+
+from canwall import cli, config
+from canwall.cli.completion import law_names
+from canwall.cli.output import _LastingConsole, print_json
+from canwall.cli.run import _strike_table
+from canwall.errors import did_you_mean
+from canwall.sweep import read_sweep
+from canwall.walls import LAWS
+
+PROGRAM: Any = typer.main.get_command(cli.app)
+
+
+@pytest.fixture
+def run(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> "Run":
+    return Run(capfd, monkeypatch)
+
+
+class Run:
+    """Runs a command in this process: exit code, standard output, standard error."""
+
+    def __init__(self, capfd: pytest.CaptureFixture[str], patch: pytest.MonkeyPatch) -> None:
+        self._capfd, self._patch = capfd, patch
+
+    def __call__(self, *arguments: object) -> tuple[object, str, str]:
+        self._patch.setattr(sys, "argv", ["canwall", *map(str, arguments)])
+        # The name of the program is not that of the one that runs the tests.
+        self._patch.setattr(sys.modules["__main__"], "__package__", None, raising=False)
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        return (ended.value.code, *self._capfd.readouterr())
+
+
+# Help, version
+
+
+def test_version(run: Run) -> None:
+    assert run("--version") == (0, f"canwall {version('canwall')}\n", "")
+
+
+@pytest.mark.parametrize("name", [*PROGRAM.commands, ""])
+def test_short_and_long_help(run: Run, name: str) -> None:
+    short, long = (run(*filter(None, (name, option))) for option in ("-h", "--help"))
+    assert short == long
+    assert (short[0], short[2]) == (0, "")
+    assert "Usage: canwall" in short[1]
+
+
+@pytest.mark.slow
+def test_as_a_module() -> None:
+    words = [sys.executable, "-m", "canwall", "--version"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    assert (done.returncode, done.stdout) == (0, f"canwall {version('canwall')}\n")
+
+
+# Completion
+
+
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("canwall sw", ["sweep"]),
+        ("canwall study st", ["staircase"]),
+        ("canwall run --stif", ["--stiffness"]),
+        ("canwall run --law half", ["half_sample", "half_sample+deadbeat"]),
+        ("canwall sweep --law mean", ["mean_force"]),
+        ("canwall ball --law rig", ["rigid"]),
+        ("canwall run epo", ["epos4"]),
+        ("canwall doctor mine", ["mine.toml"]),
+        ("canwall run none/of", []),  # the shell offers files
+    ],
+)
+def test_completion(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, line: str, offered: list[str]
+) -> None:
+    (tmp_path / "mine.toml").touch()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("_CANWALL_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", line)
+    monkeypatch.setenv("COMP_CWORD", str(line.count(" ")))
+    code, out, error = run()
+    assert (code, error) == (0, "")
+    assert out.split() == offered
+
+
+def test_all_laws_are_completed() -> None:
+    assert sorted(law_names()) == sorted(LAWS)
+
+
+# Spelling
+
+
+def test_closest_name() -> None:
+    assert did_you_mean("half_smaple", LAWS) == "; did you mean half_sample?"
+    assert did_you_mean("qqq", LAWS) == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        (["swep"], "'sweep'"),
+        (["run", "--stifness", "3"], "--stiffness"),
+        (["run", "--law", "meanforce"], "mean_force"),
+        (["ball", "--law", "rigd", "--output", "x.csv"], "rigid"),
+        (["ball", "--law", "rigid", "--tension", "clmp", "--output", "x.csv"], "clamp"),
+        (["ball", "--law", "exponential", "--option", "lenth=1", "--output", "x.csv"], "length"),
+        (["sweep", "--axis", "sped=1", "--output", "x.nc"], "speed"),
+        (["sweep", "--axis", "limits.torqe_nm=1", "--output", "x.nc"], "torque_nm"),
+        (["sweep", "--operator", "fingr", "--output", "x.nc"], "finger"),
+        (["sweep", "--axis", "servo=800hz", "--output", "x.nc"], "800Hz"),
+        (["sweep", "--table", "shft"], "shaft"),
+    ],
+    ids=lambda given: " ".join(given) if isinstance(given, list) else "",
+)
+def test_misspelt_word_of_a_command(run: Run, arguments: list[str], meant: str) -> None:
+    code, out, error = run(*arguments)
+    (line,) = error.splitlines()
+    assert (code, out) == (2, "")
+    assert line.lower().replace("\u2019", "'").endswith(f"did you mean {meant}?".lower())
+
+
+@pytest.mark.parametrize(
+    ("line", "other", "meant"),
+    [
+        ("\n[simulation]", '\n[[simulation.fault]]\nkind = "silense"\n[simulation]', "silence"),
+        (
+            "\n[simulation.hand]",
+            '\n[[simulation.hand.script]]\nmove = "aproach"\nduration_s = 1.0\n[simulation.hand]',
+            "approach",
+        ),
+        ('interface = "virtual"', 'interface = "soketcan"', "socketcan"),
+        ('law = "mean_force"         #', 'law = "mean_forse" #', "mean_force"),
+    ],
+)
+def test_misspelt_word_of_a_configuration(
+    run: Run, tmp_path: Path, line: str, other: str, meant: str
+) -> None:
+    file = config_file(tmp_path / "c.toml", {line: other})
+    code, _, error = run("run", file, "--output", tmp_path / "run")
+    assert code == 2
+    assert error.endswith(f"; did you mean {meant}?\n")
+
+
+# Output
+
+
+def strike(law: str) -> dict[str, Any]:
+    """A strike with all columns, as wide as they come."""
+    return {
+        **{"law": law, "stiffness": 1250.0, "mass_spread": 0.1, "contacts": 126},
+        **{"stiffness_in_force": 39.54, "stiffness_in_force_least": 20.0, "mass_est_kg_m2": 2e-4},
+        **{"peak_penetration_rad": 0.12345, "first_depth_rad": 0.1, "energy_out_j": 2.80556},
+        **{"referent_first_depth_rad": 0.09, "felt_ripple_n": 8.44},
+        **{"chatter": True, "chatter_frequency_hz": 143.0},
+    }
+
+
+def test_strikes_fit_into_80_columns() -> None:
+    path = "/home/somebody/haptics/laws/experimental.py:a_wall_with_quite_a_long_name"
+    written = io.StringIO()
+    console = _LastingConsole(file=written, width=80)
+    console.print(_strike_table([strike("unidirectional_damper"), strike(path)]))
+    text = written.getvalue()
+    assert max(map(len, text.splitlines())) <= 80
+    assert "…" not in text
+    for value in ("1250", "39.5", "0.2", "126", "123.45", "1.11", "2805.56", "8.44", "143 Hz"):
+        assert text.count(value) >= 2, value
+    # The file and the function, in pieces; not the folder.
+    folded = "".join(line[2:14].strip() for line in text.splitlines()[4:])
+    assert "experimental.py:a_wall_with_quite_a_long_name" in folded
+    assert "somebody" not in text
+
+
+@pytest.mark.parametrize("no_color", [True, False])
+def test_no_color(monkeypatch: pytest.MonkeyPatch, no_color: bool) -> None:
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    if no_color:
+        monkeypatch.setenv("NO_COLOR", "1")
+    table = Table("column")
+    table.add_row("in trouble", style="bold red")
+    written = io.StringIO()
+    _LastingConsole(file=written, force_terminal=True).print(table)
+    assert ("31m" in written.getvalue()) is not no_color
+
+
+def test_json_has_what_json_allows(capfd: pytest.CaptureFixture[str]) -> None:
+    content = {"a": float("nan"), "b": [1.0, float("inf")], "p": Path("x/:car:"), "c": "[red]µ"}
+    print_json(content | {"l": "x" * 300})
+    (line,) = capfd.readouterr().out.splitlines()
+    assert json.loads(line) == {
+        **{"a": None, "b": [1.0, None], "p": "x/:car:", "c": "[red]µ", "l": "x" * 300}
+    }
+
+
+def test_ball_as_json(run: Run, tmp_path: Path) -> None:
+    code, out, error = run("ball", "--law", "rigid", "--output", tmp_path / "b.csv", "--json")
+    assert (code, error) == (0, "")
+    found = json.loads(out)
+    assert (found["theta"], found["energy_start_j"]) == (0.1, 1.0)
+    assert 0.0 <= found["energy_end_j"] < 1e-9
+
+
+@pytest.mark.slow
+def test_run_as_json(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    done = command("run", "--duration", 0.3, "--output", folder, "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert json.loads(done.stdout) == {"record": str(folder)} | Record(folder).summary
+
+
+@pytest.mark.slow
+def test_latency_as_json(tmp_path: Path) -> None:
+    measured = ("--duration", "0.1", "--load", "0", "--output", tmp_path)
+    done = command("latency", *measured, "--json")
+    assert done.returncode == 0
+    assert json.loads(done.stdout) == json.loads((tmp_path / "latency.json").read_text())
+
+
+@pytest.mark.slow
+def test_sweep_as_json(tmp_path: Path) -> None:
+    file = tmp_path / "s.nc"
+    axes = ("--stiffness", "20,80", "--axis", "speed=1.0", "--axis", "phase=0.35")
+    done = command("sweep", config.shipped("config/ideal.toml"), *axes, "--output", file, "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+    printed, written = xr.Dataset.from_dict(json.loads(done.stdout)), read_sweep(file)
+    assert printed.sizes == written.sizes
+    assert set(printed.variables) == set(written.variables)
+    for name in ("chatters", "energy_out", "stiffness"):
+        assert printed[name].equals(written[name])

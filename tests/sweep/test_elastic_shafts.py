@@ -1,0 +1,36 @@
+"""Walls that know the elastic shaft of their drive."""
+
+import numpy as np
+import pytest
+from rig import SIM_CONFIG
+
+from canwall import config
+from canwall.sweep import OPERATORS, make_plan
+from canwall.sweep.plan import compute_piece
+
+
+@pytest.mark.slow
+def test_cap_keeps_every_wall_quiet_on_an_elastic_shaft() -> None:
+    """Seeded strikes of all operators; without a bound by the shaft, most of them chatter."""
+    asked = np.random.default_rng(14).uniform(30.0, 5000.0, 3).round()
+    plan = make_plan(
+        config.load(SIM_CONFIG),
+        {
+            "operator": list(OPERATORS),
+            "model": "drive",
+            "servo": "1600Hz",
+            "friction": 0.01,
+            "simulation.shaft_hz": [400.0, 250.0],
+            "stiffness": asked.tolist(),
+            "press": 1.2,
+            "speed": 0.8,
+            "phase": 0.35,
+        },
+    )
+    measured = np.concatenate([compute_piece(plan, i) for i in range(plan.pieces)])
+    assert measured.shape == (12, 3)
+    assert not measured["chatters"].any()
+    in_force = measured["stiffness_in_force"]
+    assert (in_force > 0.5).all()
+    # The softer shaft bears less, in every hand.
+    assert (in_force[1::2] < in_force[::2]).all()
