@@ -121,6 +121,7 @@ def test_timers_go_on_in_steady_operation(monkeypatch: pytest.MonkeyPatch) -> No
         begin_s = time.monotonic()
         while (passed_s := time.monotonic() - begin_s) < 2.0 and EMCY not in dict(heard):
             if passed_s < 0.1:
+                last_rpdo_s = passed_s
                 master.send(DataFrame(RPDO[3], struct.pack("<Hh", 0x0F, 10)))
             master.send(DataFrame(SYNC, b""))
             cycles += 1
@@ -131,7 +132,8 @@ def test_timers_go_on_in_steady_operation(monkeypatch: pytest.MonkeyPatch) -> No
                 heard.append((message.arbitration_id, bytes(message.data)))
     ids = [can_id for can_id, _ in heard]
     assert ids.count(TPDO[3]) >= cycles - 1
-    assert ids.count(HEARTBEAT) >= 3
+    # A machine that stands still between two RPDOs, or two ticks, misses some of either.
+    assert 1 <= ids.count(HEARTBEAT) <= passed_s / 0.01 + 1
     assert struct.unpack_from("<H", dict(heard)[EMCY])[0] == 0x8250
-    assert passed_s > 0.13
+    assert passed_s - last_rpdo_s > 0.04
     assert polls < cycles / 5
