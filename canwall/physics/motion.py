@@ -188,6 +188,13 @@ def _time_to_break_loose(
             return math.inf, 0.0
         direction = 1.0 if force.slope > 0.0 else -1.0
         return max(stiction - direction * pull, 0.0) / abs(force.slope), direction
+    # What decays is monotone: within these bounds the force stays.
+    ramp = force.slope * horizon
+    decay = force.excess * -math.expm1(-force.rate * horizon)
+    lowest = pull + min(ramp, 0.0) - max(decay, 0.0)
+    highest = pull + max(ramp, 0.0) - min(decay, 0.0)
+    if -stiction < lowest and highest < stiction:
+        return math.inf, 0.0
     # The acceleration of a free unit mass is the force, so the remaining friction is an event
     # function of its motion.
     free = SmoothMotion(1.0, 0.0, 0.0, 0.0, 0.0, pull, force.slope, force.excess, force.rate)
