@@ -13,6 +13,7 @@ a few counts, so that a light hand is told from a heavy one before the wall acts
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,10 +32,10 @@ REGRESSION = np.dtype(
         ("resolution", "f8"),  # one count [rad]
         ("lightest", "f8"),  # smallest mass that there may be, beyond an elastic shaft
         ("delay_share", "f8"),  # of a period, up to the instant of actuation
-        # The observer of [y, ẏ, ÿ], its gain, and its state for positions, torque (of a unit mass)
-        # and velocity; what it does not expect of them at this sample, and one count.
+        # The observer of [y, ẏ, ÿ], its gain, and its state for positions, torque (of a unit mass),
+        # velocity and direction; what it does not expect of them at this sample, and one count.
         ("gain", "f8", (3,)),
-        ("observed", "f8", (3, 3)),
+        ("observed", "f8", (3, 4)),
         # Inertia of the rotor on an elastic shaft, 0: rigid, and compliance of the shaft over T²;
         # for a unit mass under the torque, the part of its next second difference that the last
         # period made, and the second difference; torque in the shaft and position behind it.
@@ -44,13 +45,14 @@ REGRESSION = np.dtype(
         ("bend", "f8"),
         ("shaft_torque", "f8"),
         ("load", "f8"),
-        ("surprise", "f8", (4,)),
-        ("information", "f8", (4, 4)),  # weighted sums of their products
+        ("surprise", "f8", (5,)),
+        ("information", "f8", (5, 5)),  # weighted sums of their products
+        ("reduced", "f8", (3, 3)),  # the same without friction and what is steady
         ("noise", "f8"),  # mean square of what nothing explains [rad²]
         ("hand_torque", "f8"),  # surprise by a torque that changes as fast as a hand's
         ("samples", "f8", (_RECENT,)),  # the last ones, newest first [rad]
         ("way", "f8"),  # to the last sample [rad]
-        ("steady", "i8"),  # samples in a row that moved on in one direction
+        ("steady", "i8"),  # samples since the handle stuck, or turned on an elastic shaft
         ("probe", "f8"),  # torque before a contact [N·m]
         ("probe_samples", "i8"),  # half its period
         ("probed", "i8"),  # samples of the present probe
@@ -85,6 +87,8 @@ _MEMORY, _DOUBTED = 0.98, 0.1
 #: Before the first torque: standard deviation of m₀/m about 1, with m₀ the lightest mass; mean and
 #: standard deviation of b/m [1/s]; standard deviation of what is steady [counts].
 _PRIOR_LIGHTNESS, _PRIOR_RATE, _PRIOR_RATE_DEVIATION, _PRIOR_STEADY = 0.7, 100.0, 150.0, 4.0
+#: Coulomb friction that there may be [N·m].
+_FRICTION = 0.02
 #: Time before a contact from which on the handle is probed [s], and half the period of the probe
 #: [samples]: as slow as the observer lets through.
 _PROBE_S, _PROBE_SAMPLES = 0.06, 4
@@ -117,7 +121,7 @@ def set_regression(
     regression["delay_share"] = delay - math.floor(delay)
     bandwidth = _OBSERVER_BEHIND_SHAFT_HZ if shaft else _OBSERVER_HZ
     regression["gain"] = gain = _observer_gain(bandwidth, period)
-    regression["surprise"][3] = abs(count)
+    regression["surprise"][4] = abs(count)
     regression["hand_torque"] = _HAND_RATE * period / gain[2]
     slower = round(_OBSERVER_HZ / bandwidth)
     regression["probe_samples"] = samples = slower * _PROBE_SAMPLES
@@ -175,6 +179,7 @@ def learn(regression: Record, estimator: Record, y_sample: float, mass: float) -
     if regression.rotor > 0.0:
         _observe(regression, _advance_load(regression, y_sample))
     else:
+        _add_direction(regression, y_sample)
         _observe(regression, y_sample)
     steps = _torque_steps(estimator) * regression.period * regression.period
     explained = _is_explained(regression, steps)
@@ -197,10 +202,26 @@ def learn(regression: Record, estimator: Record, y_sample: float, mass: float) -
 def _observe(regression: Record, y_sample: float) -> None:
     """Correct the observer: what it did not expect of the sample, of torque and of velocity."""
     surprise, observed = regression.surprise, regression.observed
-    for c in range(3):
+    for c in range(4):
         surprise[c] = (y_sample if c == 0 else 0.0) - observed[0, c]
         for i in range(3):
             observed[i, c] += regression.gain[i] * surprise[c]
+
+
+@compiled
+def _add_direction(regression: Record, y_sample: float) -> None:
+    """Add to the observer the direction of the last period, as an acceleration.
+
+    Where the velocity, a straight line over the period, changes its sign, it is the mean.
+    """
+    t, x, before = regression.period, regression.observed, regression.samples
+    begin = y_sample - before[1]
+    end = 3.0 * y_sample - 4.0 * before[0] + before[1]
+    both = abs(begin) + abs(end)
+    if both > 0.0:
+        direction = (begin + end) / both
+        x[0, 3] += 0.5 * t * t * direction
+        x[1, 3] += t * direction
 
 
 @compiled
@@ -249,6 +270,7 @@ def _is_explained(regression: Record, steps: float) -> bool:
     """Return True if there is a mass for which the torque explains the motion."""
     rest = abs(regression.surprise[0]) - _UNEXPLAINED * math.sqrt(regression.noise)
     torque = abs(regression.surprise[1]) + _UNTIMELY_MOST * steps
+    torque += _FRICTION * abs(regression.surprise[3])
     torque += _UNTIMELY_MOST * steps * regression.softness * regression.lightest
     return rest * regression.lightest <= torque
 
@@ -256,7 +278,11 @@ def _is_explained(regression: Record, steps: float) -> bool:
 @compiled
 def _note_way(regression: Record, y_sample: float, explained: bool) -> None:
     way = y_sample - regression.samples[0]
-    goes_on = abs(way) >= _LEAST_WAY * regression.resolution and way * regression.way >= 0.0
+    least = _LEAST_WAY * regression.resolution
+    if regression.rotor > 0.0:
+        goes_on = abs(way) >= least and way * regression.way >= 0.0
+    else:
+        goes_on = max(abs(way), abs(regression.way)) >= least
     regression.steady = regression.steady + 1 if goes_on and explained else 0
     regression.way = way
     for age in range(_RECENT - 1, 0, -1):
@@ -280,20 +306,20 @@ def _add_information(regression: Record, untimely: float, mass: float) -> None:
     """
     r, information = regression.surprise, regression.information
     weight = 1.0 / (regression.noise + untimely * untimely)
-    rest = r[0] + r[1] / mass
+    rest = max(abs(r[0] + r[1] / mass) - _FRICTION / mass * abs(r[3]), 0.0)
     if weight * rest * rest > _UNEXPLAINED * _UNEXPLAINED:
         _doubt(regression)
     exchanged = min(1.0 - _MEMORY, weight * r[1] * r[1] / max(information[1, 1], 1e-300))
-    for i in range(4):
-        for c in range(4):
+    for i in range(5):
+        for c in range(5):
             information[i, c] = (1.0 - exchanged) * information[i, c] + weight * r[i] * r[c]
 
 
 @compiled
 def _doubt(regression: Record) -> None:
     information = regression.information
-    for i in range(4):
-        for c in range(4):
+    for i in range(5):
+        for c in range(5):
             information[i, c] *= _DOUBTED
 
 
@@ -301,21 +327,33 @@ def _doubt(regression: Record) -> None:
 def lightness(regression: Record) -> tuple[float, float]:
     """Return the likeliest 1/m, of the load on an elastic shaft, and its standard deviation.
 
-    They are the least squares of r₀ + r₁·(1/m) − r₂·(b/m) − r₃·c, with what is known before the
-    first torque; c is what is steady.
+    They are the least squares of r₀ + r₁·(1/m) − r₂·(b/m) − r₃·(f_c/m) − r₄·c, with what is known
+    before the first torque; c is what is steady.
     """
-    s, lightest = regression.information, regression.lightest
-    # r₃ is eliminated.
-    r03, r13, r23 = s[0, 3], s[1, 3], s[2, 3]
-    steady = s[3, 3] + 1.0 / _PRIOR_STEADY**2
+    lightest = regression.lightest
+    s = _without_friction(regression)
     of_lightness = (lightest / _PRIOR_LIGHTNESS) ** 2
     of_rate = 1.0 / _PRIOR_RATE_DEVIATION**2
-    p11, p12 = s[1, 1] - r13 * r13 / steady + of_lightness, -(s[1, 2] - r13 * r23 / steady)
-    p22 = s[2, 2] - r23 * r23 / steady + of_rate
-    q1 = -(s[0, 1] - r03 * r13 / steady) + of_lightness / lightest
-    q2 = s[0, 2] - r03 * r23 / steady + of_rate * _PRIOR_RATE
+    p11, p12, p22 = s[1, 1] + of_lightness, -s[1, 2], s[2, 2] + of_rate
+    q1 = -s[0, 1] + of_lightness / lightest
+    q2 = s[0, 2] + of_rate * _PRIOR_RATE
     determinant = p11 * p22 - p12 * p12
     return (q1 * p22 - q2 * p12) / determinant, math.sqrt(p22 / determinant)
+
+
+@compiled
+def _without_friction(regression: Record) -> Any:
+    """Return the information, shape (3, 3), less what friction and a steady rest may explain."""
+    s, reduced = regression.information, regression.reduced
+    steady = s[4, 4] + 1.0 / _PRIOR_STEADY**2
+    friction = s[3, 3] - s[3, 4] * s[3, 4] / steady + (regression.lightest / _FRICTION) ** 2
+    for i in range(3):
+        i3 = s[i, 3] - s[i, 4] * s[3, 4] / steady
+        for c in range(i + 1):
+            c3 = s[c, 3] - s[c, 4] * s[3, 4] / steady
+            value = s[i, c] - s[i, 4] * s[c, 4] / steady - i3 * c3 / friction
+            reduced[i, c] = reduced[c, i] = value
+    return reduced
 
 
 @compiled
@@ -329,7 +367,7 @@ def predict_regression(regression: Record, older: float, newer: float) -> None:
         regression.bend = regression.begun + way
         regression.begun = t * speed - way
         return
-    for c in range(3):
+    for c in range(4):
         x[0, c] += t * x[1, c] + 0.5 * t * t * x[2, c]
         x[1, c] += t * x[2, c]
     x[0, 1] += way
