@@ -271,7 +271,7 @@ def _torque_acted(estimator: Record) -> bool:
 @compiled
 def _follow(bank: Record) -> bool:
     """Move the mass in force towards the likeliest one; return True if it moved."""
-    likeliest, deviation = lightness(bank.regression[0])
+    likeliest, deviation = lightness(bank.regression[0], bank.mass)
     bank.spread = deviation / max(likeliest, deviation)
     if likeliest > 0.0:
         # Rotor and load together.

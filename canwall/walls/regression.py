@@ -324,14 +324,14 @@ def _doubt(regression: Record) -> None:
 
 
 @compiled
-def lightness(regression: Record) -> tuple[float, float]:
+def lightness(regression: Record, mass: float) -> tuple[float, float]:
     """Return the likeliest 1/m, of the load on an elastic shaft, and its standard deviation.
 
     They are the least squares of r₀ + r₁·(1/m) − r₂·(b/m) − r₃·(f_c/m) − r₄·c, with what is known
-    before the first torque; c is what is steady.
+    before the first torque; c is what is steady. mass: the one in force, for the friction.
     """
     lightest = regression.lightest
-    s = _without_friction(regression)
+    s = _without_friction(regression, mass - regression.rotor)
     of_lightness = (lightest / _PRIOR_LIGHTNESS) ** 2
     of_rate = 1.0 / _PRIOR_RATE_DEVIATION**2
     p11, p12, p22 = s[1, 1] + of_lightness, -s[1, 2], s[2, 2] + of_rate
@@ -342,11 +342,11 @@ def lightness(regression: Record) -> tuple[float, float]:
 
 
 @compiled
-def _without_friction(regression: Record) -> Any:
+def _without_friction(regression: Record, mass: float) -> Any:
     """Return the information, shape (3, 3), less what friction and a steady rest may explain."""
     s, reduced = regression.information, regression.reduced
     steady = s[4, 4] + 1.0 / _PRIOR_STEADY**2
-    friction = s[3, 3] - s[3, 4] * s[3, 4] / steady + (regression.lightest / _FRICTION) ** 2
+    friction = s[3, 3] - s[3, 4] * s[3, 4] / steady + (mass / _FRICTION) ** 2
     for i in range(3):
         i3 = s[i, 3] - s[i, 4] * s[3, 4] / steady
         for c in range(i + 1):

@@ -36,13 +36,13 @@ def play(mass: float, torques: Array, push: Array, jitter: float = 0.0) -> tuple
     y, v = 0.0, -0.5
     for torque, pushed in zip(torques.tolist(), push.tolist(), strict=True):
         sample = COUNT * round((y + jitter * v * rng.uniform(-0.5, 0.5)) / COUNT)
-        learn(regression[0], estimator[0], sample, 1.0 / max(lightness(regression[0])[0], 200.0))
+        learn(regression[0], estimator[0], sample, 1.0 / max(lightness(regression[0], 3e-4)[0], 200.0))
         predict_regression(regression[0], torque, torque)
         estimator["in_flight"][0] = np.roll(estimator["in_flight"][0], 1)
         estimator["in_flight"][0, 0] = torque
         a = (torque + pushed - 0.01 * v) / mass
         y, v = y + PERIOD * v + 0.5 * PERIOD**2 * a, v + PERIOD * a
-    return lightness(regression[0])
+    return lightness(regression[0], 3e-4)
 
 
 def test_observer_has_three_equal_poles() -> None:
@@ -90,14 +90,14 @@ def test_another_hand_is_another_mass() -> None:
     for j in range(200):
         mass = 3.6e-3 if j < 100 else 2e-4
         torque = 0.4 if j % 40 < 3 else 0.0
-        known = 1.0 / max(lightness(regression[0])[0], 200.0)
+        known = 1.0 / max(lightness(regression[0], 3e-4)[0], 200.0)
         learn(regression[0], estimator[0], COUNT * round(y / COUNT), known)
         predict_regression(regression[0], torque, torque)
         estimator["in_flight"][0] = np.roll(estimator["in_flight"][0], 1)
         estimator["in_flight"][0, 0] = torque
         a = torque / mass
         y, v = y + PERIOD * v + 0.5 * PERIOD**2 * a, v + PERIOD * a
-    assert lightness(regression[0])[0] == pytest.approx(1.0 / 2e-4, rel=0.1)
+    assert lightness(regression[0], 3e-4)[0] == pytest.approx(1.0 / 2e-4, rel=0.1)
 
 
 def test_probe_is_shortly_before_a_contact_only() -> None:
