@@ -1,10 +1,10 @@
 """The mass at the handle, by a regression on what an observer does not expect.
 
 One fast observer, with a bias of its own, follows the positions without any torque, the torque
-alone, and the velocity alone. What it does not expect of the positions is −1/m times the same of
-the torque, plus b/m times that of the velocity, plus something steady from a hand whose force
-changes steadily. What changes more slowly (the operator's push, friction in one direction) is in
-none of them.
+alone, the velocity alone, and its direction alone. What it does not expect of the positions is −1/m
+times the same of the torque, plus b/m times that of the velocity, plus f_c/m times that of the
+direction (Coulomb friction), plus something steady from a hand whose force changes steadily. What
+changes more slowly (the operator's push, friction in one direction) is in none of them.
 
 On an elastic shaft it is the load that is observed, by what the rotor tells of it.
 
@@ -13,7 +13,6 @@ a few counts, so that a light hand is told from a heavy one before the wall acts
 """
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +46,6 @@ REGRESSION = np.dtype(
         ("load", "f8"),
         ("surprise", "f8", (5,)),
         ("information", "f8", (5, 5)),  # weighted sums of their products
-        ("reduced", "f8", (3, 3)),  # the same without friction and what is steady
         ("noise", "f8"),  # mean square of what nothing explains [rad²]
         ("hand_torque", "f8"),  # surprise by a torque that changes as fast as a hand's
         ("samples", "f8", (_RECENT,)),  # the last ones, newest first [rad]
@@ -68,8 +66,9 @@ _OBSERVER_HZ, _OBSERVER_BEHIND_SHAFT_HZ = 100.0, 50.0
 #: Noise of its surprise by the steps of the encoder [counts], and share of the noise that is
 #: exchanged with a sample: drives latch their position at ticks of their own.
 _QUANTISATION, _NOISE_SHARE = 0.5, 1.0 / 16.0
-#: Samples in one direction after which friction is part of the bias, and the least way of each
-#: [counts]: a handle that sticks is as heavy as the world.
+#: Samples after which the bias has followed a handle that broke loose, and the least way of each, or
+#: of its neighbour where the handle turns [counts]: one that sticks is as heavy as the world. An
+#: elastic shaft hides its turns: there the way goes on in one direction.
 _STEADY, _LEAST_WAY = 6, 1.5
 #: Fastest change of a hand's force [N·m/s]. A torque that changes no faster may be its answer to
 #: the hand, and then says nothing of the mass: a wall that gives way to none looks heavy.
@@ -87,7 +86,8 @@ _MEMORY, _DOUBTED = 0.98, 0.1
 #: Before the first torque: standard deviation of m₀/m about 1, with m₀ the lightest mass; mean and
 #: standard deviation of b/m [1/s]; standard deviation of what is steady [counts].
 _PRIOR_LIGHTNESS, _PRIOR_RATE, _PRIOR_RATE_DEVIATION, _PRIOR_STEADY = 0.7, 100.0, 150.0, 4.0
-#: Coulomb friction that there may be [N·m].
+#: Coulomb friction that there may be: standard deviation, and the most that explains a surprise
+#: [N·m].
 _FRICTION = 0.02
 #: Time before a contact from which on the handle is probed [s], and half the period of the probe
 #: [samples]: as slow as the observer lets through.
@@ -200,7 +200,7 @@ def learn(regression: Record, estimator: Record, y_sample: float, mass: float) -
 
 @compiled
 def _observe(regression: Record, y_sample: float) -> None:
-    """Correct the observer: what it did not expect of the sample, of torque and of velocity."""
+    """Correct the observer: what it did not expect of the sample, of torque and of motion."""
     surprise, observed = regression.surprise, regression.observed
     for c in range(4):
         surprise[c] = (y_sample if c == 0 else 0.0) - observed[0, c]
@@ -330,30 +330,26 @@ def lightness(regression: Record, mass: float) -> tuple[float, float]:
     They are the least squares of r₀ + r₁·(1/m) − r₂·(b/m) − r₃·(f_c/m) − r₄·c, with what is known
     before the first torque; c is what is steady. mass: the one in force, for the friction.
     """
-    lightest = regression.lightest
-    s = _without_friction(regression, mass - regression.rotor)
+    s, lightest = regression.information, regression.lightest
+    steady = s[4, 4] + 1.0 / _PRIOR_STEADY**2
+    friction = s[3, 3] - s[3, 4] * s[3, 4] / steady + ((mass - regression.rotor) / _FRICTION) ** 2
     of_lightness = (lightest / _PRIOR_LIGHTNESS) ** 2
     of_rate = 1.0 / _PRIOR_RATE_DEVIATION**2
-    p11, p12, p22 = s[1, 1] + of_lightness, -s[1, 2], s[2, 2] + of_rate
-    q1 = -s[0, 1] + of_lightness / lightest
-    q2 = s[0, 2] + of_rate * _PRIOR_RATE
+    p11 = _left_of(s, 1, 1, steady, friction) + of_lightness
+    p12 = -_left_of(s, 1, 2, steady, friction)
+    p22 = _left_of(s, 2, 2, steady, friction) + of_rate
+    q1 = -_left_of(s, 0, 1, steady, friction) + of_lightness / lightest
+    q2 = _left_of(s, 0, 2, steady, friction) + of_rate * _PRIOR_RATE
     determinant = p11 * p22 - p12 * p12
     return (q1 * p22 - q2 * p12) / determinant, math.sqrt(p22 / determinant)
 
 
 @compiled
-def _without_friction(regression: Record, mass: float) -> Any:
-    """Return the information, shape (3, 3), less what friction and a steady rest may explain."""
-    s, reduced = regression.information, regression.reduced
-    steady = s[4, 4] + 1.0 / _PRIOR_STEADY**2
-    friction = s[3, 3] - s[3, 4] * s[3, 4] / steady + (mass / _FRICTION) ** 2
-    for i in range(3):
-        i3 = s[i, 3] - s[i, 4] * s[3, 4] / steady
-        for c in range(i + 1):
-            c3 = s[c, 3] - s[c, 4] * s[3, 4] / steady
-            value = s[i, c] - s[i, 4] * s[c, 4] / steady - i3 * c3 / friction
-            reduced[i, c] = reduced[c, i] = value
-    return reduced
+def _left_of(s: Record, i: int, c: int, steady: float, friction: float) -> float:
+    """Return what r₄ and r₃ leave of an element of the information: they are eliminated."""
+    i3, c3 = s[i, 3] - s[i, 4] * s[3, 4] / steady, s[c, 3] - s[c, 4] * s[3, 4] / steady
+    left: float = s[i, c] - s[i, 4] * s[c, 4] / steady - i3 * c3 / friction
+    return left
 
 
 @compiled

@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import place_poles
 
+from canwall.physics import advance, make_plant
 from canwall.walls import ESTIMATOR, WALL
 from canwall.walls.regression import (
     REGRESSION,
@@ -98,6 +99,25 @@ def test_another_hand_is_another_mass() -> None:
         a = torque / mass
         y, v = y + PERIOD * v + 0.5 * PERIOD**2 * a, v + PERIOD * a
     assert lightness(regression[0], 3e-4)[0] == pytest.approx(1.0 / 2e-4, rel=0.1)
+
+
+@pytest.mark.parametrize("mass", [2e-4, 4e-4])
+def test_swing_against_friction_tells_the_mass(mass: float) -> None:
+    """Of a handle that turns every five samples: not one goes on in one direction for six."""
+    regression, estimator = made(), np.zeros(1, ESTIMATOR)
+    plant = make_plant(mass, coulomb=0.01)
+    y, v, known = 0.0, 0.0, 2.0 * mass
+    for j in range(200):
+        torque = 250.0 * mass * math.sin(2.0 * math.pi * j / 10.0)
+        learn(regression[0], estimator[0], COUNT * round(y / COUNT), known)
+        found, deviation = lightness(regression[0], known)
+        known = 1.0 / max(found, 200.0)
+        predict_regression(regression[0], torque, torque)
+        estimator["in_flight"][0] = np.roll(estimator["in_flight"][0], 1)
+        estimator["in_flight"][0, 0] = torque
+        y, v, _ = advance(plant[0], y, v, torque, 0.0, PERIOD)
+    assert known == pytest.approx(mass, rel=0.1)
+    assert deviation < 0.15 * found
 
 
 def test_probe_is_shortly_before_a_contact_only() -> None:
