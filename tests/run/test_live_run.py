@@ -327,7 +327,6 @@ def test_guard_and_identification_change_in_a_run(attended: Callable[..., Attend
     run = attended(
         {
             "operator.adapt": True,
-            "estimator.delay_margin_cycles": 0.0,  # the delay of the ideal servo is known
             "mechanics.inertia_kg_m2": 1.0e-4,
             "mechanics.viscous_nm_s_per_rad": 5.0e-4,
             "simulation.hand.strikes": 2,
