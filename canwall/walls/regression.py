@@ -66,8 +66,8 @@ _OBSERVER_HZ, _OBSERVER_BEHIND_SHAFT_HZ = 100.0, 50.0
 #: Noise of its surprise by the steps of the encoder [counts], and share of the noise that is
 #: exchanged with a sample: drives latch their position at ticks of their own.
 _QUANTISATION, _NOISE_SHARE = 0.5, 1.0 / 16.0
-#: Samples after which the bias has followed a handle that broke loose, and the least way of each, or
-#: of its neighbour where the handle turns [counts]: one that sticks is as heavy as the world. An
+#: Samples after which the bias has followed a handle that broke loose, and the least way of each,
+#: or of its neighbour where the handle turns [counts]: one that sticks is as heavy as the world. An
 #: elastic shaft hides its turns: there the way goes on in one direction.
 _STEADY, _LEAST_WAY = 6, 1.5
 #: Fastest change of a hand's force [N·m/s]. A torque that changes no faster may be its answer to

@@ -30,6 +30,10 @@ def made() -> NDArray[np.void]:
     return regression
 
 
+def mass_known(regression: NDArray[np.void]) -> float:
+    return 1.0 / max(lightness(regression[0], 3e-4)[0], 200.0)
+
+
 def play(mass: float, torques: Array, push: Array, jitter: float = 0.0) -> tuple[float, float]:
     """Return 1/m and its deviation after torques that act at once, beside a hand's push."""
     regression, estimator = made(), np.zeros(1, ESTIMATOR)
@@ -37,7 +41,7 @@ def play(mass: float, torques: Array, push: Array, jitter: float = 0.0) -> tuple
     y, v = 0.0, -0.5
     for torque, pushed in zip(torques.tolist(), push.tolist(), strict=True):
         sample = COUNT * round((y + jitter * v * rng.uniform(-0.5, 0.5)) / COUNT)
-        learn(regression[0], estimator[0], sample, 1.0 / max(lightness(regression[0], 3e-4)[0], 200.0))
+        learn(regression[0], estimator[0], sample, mass_known(regression))
         predict_regression(regression[0], torque, torque)
         estimator["in_flight"][0] = np.roll(estimator["in_flight"][0], 1)
         estimator["in_flight"][0, 0] = torque
@@ -91,8 +95,7 @@ def test_another_hand_is_another_mass() -> None:
     for j in range(200):
         mass = 3.6e-3 if j < 100 else 2e-4
         torque = 0.4 if j % 40 < 3 else 0.0
-        known = 1.0 / max(lightness(regression[0], 3e-4)[0], 200.0)
-        learn(regression[0], estimator[0], COUNT * round(y / COUNT), known)
+        learn(regression[0], estimator[0], COUNT * round(y / COUNT), mass_known(regression))
         predict_regression(regression[0], torque, torque)
         estimator["in_flight"][0] = np.roll(estimator["in_flight"][0], 1)
         estimator["in_flight"][0, 0] = torque
