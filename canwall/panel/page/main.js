@@ -19,6 +19,7 @@ import { beginTheme, reducedMotion, toggleTheme } from "./theme.js";
 const WINDOW_S = 5;
 const FRAME_MS = 1000 / 31;
 const CALM_FRAME_MS = 250;
+const BROWSER_FRAME_MS = 1000 / 60;
 const TEXT_MS = 120;
 const CONTACTS = 60;
 
@@ -51,7 +52,7 @@ let run = { state: "none" };
 let settings = null;
 let contacts = [];
 let marks = [];
-let fresh = true; // something has come that is not drawn yet
+let awaited = false; // a frame that draws what has come
 let frames = 0;
 let view = "live";
 
@@ -68,11 +69,11 @@ link.addEventListener("closed", () => {
 });
 link.addEventListener("signals", ({ detail }) => {
   history.append(detail);
-  fresh = true;
+  renew();
 });
 link.addEventListener("contact_points", ({ detail }) => {
   contact.append(detail);
-  fresh = true;
+  renew();
 });
 link.addEventListener("status", ({ detail }) => {
   showStatus(detail);
@@ -120,7 +121,7 @@ function showRun(next) {
   run = next;
   stop.running = ["attached", "starting"].includes(run.state);
   scene.running = stop.running;
-  fresh = true;
+  renew();
   if (another) forget();
   if (another || begins) stop.reset();
   const idle = ["none", "ended", "failed"].includes(run.state);
@@ -144,7 +145,7 @@ function forget() {
   marks = [];
   drawEnergy(at("energy"), contacts);
   showMarks(marks);
-  fresh = true;
+  renew();
 }
 
 function showState(state, text) {
@@ -197,27 +198,33 @@ async function start() {
   at("start").disabled = false;
 }
 
-/** One loop draws whatever is the latest. */
-function loop(now) {
-  requestAnimationFrame(loop);
-  const least = reducedMotion() ? CALM_FRAME_MS : FRAME_MS - 4;
-  if (fresh && now - loop.drawn >= least && view === "live") {
-    fresh = false;
-    loop.drawn = now;
-    frames++;
-    scene.draw(now);
-    for (const plot of plots) plot.draw(now);
-    contact.draw(now);
-  }
-  if (now - loop.told >= TEXT_MS) {
-    loop.told = now;
-    const latest = (name) => (stop.running ? (history.lowest(column(name)) + history.highest(column(name))) / 2 : NaN);
-    showKeyValues({
-      y: latest("y"), force: latest("force"), stiffness: latest("stiffness_in_force"), radius: settings?.handle_radius_m,
-    });
-  }
+/** Ask for a frame that draws the latest. Without anything new there is none, and costs nothing. */
+function renew() {
+  if (awaited || view !== "live") return;
+  awaited = true;
+  const least = reducedMotion() ? CALM_FRAME_MS : FRAME_MS;
+  const rest = draw.begun + least - performance.now() - BROWSER_FRAME_MS;
+  if (rest > 0) setTimeout(() => requestAnimationFrame(draw), rest);
+  else requestAnimationFrame(draw);
 }
-loop.drawn = loop.told = 0;
+
+function draw(now) {
+  awaited = false;
+  draw.begun = now;
+  frames++;
+  scene.draw(now);
+  for (const plot of plots) plot.draw(now);
+  contact.draw(now);
+}
+draw.begun = 0;
+
+function showLatest() {
+  const latest = (name) => (stop.running ? (history.lowest(column(name)) + history.highest(column(name))) / 2 : NaN);
+  showKeyValues({
+    y: latest("y"), force: latest("force"), stiffness: latest("stiffness_in_force"), radius: settings?.handle_radius_m,
+  });
+}
+setInterval(showLatest, TEXT_MS);
 setInterval(() => {
   at("f-page").textContent = `${Math.round(frames / 2)} frames/s`;
   frames = 0;
@@ -235,7 +242,7 @@ function showView() {
     else at(`nav-${name}`).removeAttribute("aria-current");
   }
   if (view === "recorded") recorded.begin();
-  fresh = true;
+  renew();
 }
 addEventListener("hashchange", showView);
 
@@ -274,4 +281,3 @@ beginTheme();
 showView();
 new ResizeObserver(() => drawEnergy(at("energy"), contacts)).observe(at("energy"));
 link.connect();
-requestAnimationFrame(loop);
