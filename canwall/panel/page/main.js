@@ -17,9 +17,7 @@ import { define } from "./tables.js";
 import { beginTheme, reducedMotion, toggleTheme } from "./theme.js";
 
 const WINDOW_S = 5;
-const FRAME_MS = 1000 / 31;
 const CALM_FRAME_MS = 250;
-const BROWSER_FRAME_MS = 1000 / 60;
 const TEXT_MS = 120;
 const CONTACTS = 60;
 
@@ -198,12 +196,11 @@ async function start() {
   at("start").disabled = false;
 }
 
-/** Ask for a frame that draws the latest. Without anything new there is none, and costs nothing. */
+/** Ask for a frame that draws the latest: as often as the server sends, and not without anything new. */
 function renew() {
   if (awaited || view !== "live") return;
   awaited = true;
-  const least = reducedMotion() ? CALM_FRAME_MS : FRAME_MS;
-  const rest = draw.begun + least - performance.now() - BROWSER_FRAME_MS;
+  const rest = reducedMotion() ? draw.begun + CALM_FRAME_MS - performance.now() : 0;
   if (rest > 0) setTimeout(() => requestAnimationFrame(draw), rest);
   else requestAnimationFrame(draw);
 }
