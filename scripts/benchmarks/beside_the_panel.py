@@ -99,7 +99,7 @@ def _turn(file: Path, folder: Path, browser: Any) -> dict[str, Any]:
 
 
 def _page_beside(folder: Path, browser: Any, run: "subprocess.Popen[bytes]") -> dict[str, Any]:
-    """Show a run in the browser to its end; frames that it draws a second, and shares of a processor."""
+    """Show a run in the browser to its end; frames drawn a second, and shares of a processor."""
     while not (folder / "live.json").exists():
         assert run.poll() is None
         time.sleep(0.05)
