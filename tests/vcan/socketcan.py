@@ -19,6 +19,8 @@ import pytest
 from commands import GUARD_SAID, config_file, torque_is_on
 from other_nodes import OtherNodes
 
+import canwall.cycle.way_out
+import canwall.drive.other_masters
 import canwall.record.recorder
 import canwall.record.writer
 from canwall import cli, config
@@ -154,11 +156,21 @@ def _main(words: list[str], out: Path, err: Path) -> None:
 def light() -> Iterator[None]:
     """Runs of this process are not drawn, and the writer of their record is forked as well.
 
-    Neither has to do with the bus, and each takes an emulated processor ten seconds.
+    Neither has to do with the bus, and each takes an emulated processor ten seconds. One that its
+    machine has no time for pauses for seconds, which is no call that hangs.
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(canwall.record.Recorder, "draw", lambda recorder, given_up: [])
         patch.setattr(canwall.record.recorder.subprocess, "Popen", _ForkedWriter)
+        patch.setattr(canwall.cycle.way_out, "_STANDSTILL_S", 60.0)
+        yield
+
+
+@contextlib.contextmanager
+def long_ears() -> Iterator[None]:
+    """Processes that begin meanwhile listen for another master for longer than a pause lasts."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(canwall.drive.other_masters, "_LISTEN_S", 20.0)
         yield
 
 
