@@ -34,6 +34,13 @@ def mass_known(regression: NDArray[np.void]) -> float:
     return 1.0 / max(lightness(regression[0], 3e-4)[0], 200.0)
 
 
+def send(regression: NDArray[np.void], estimator: NDArray[np.void], torque: float) -> None:
+    """Send a torque that acts at once."""
+    predict_regression(regression[0], torque, torque)
+    estimator["in_flight"][0] = np.roll(estimator["in_flight"][0], 1)
+    estimator["in_flight"][0, 0] = torque
+
+
 def play(mass: float, torques: Array, push: Array, jitter: float = 0.0) -> tuple[float, float]:
     """Return 1/m and its deviation after torques that act at once, beside a hand's push."""
     regression, estimator = made(), np.zeros(1, ESTIMATOR)
@@ -42,9 +49,7 @@ def play(mass: float, torques: Array, push: Array, jitter: float = 0.0) -> tuple
     for torque, pushed in zip(torques.tolist(), push.tolist(), strict=True):
         sample = COUNT * round((y + jitter * v * rng.uniform(-0.5, 0.5)) / COUNT)
         learn(regression[0], estimator[0], sample, mass_known(regression))
-        predict_regression(regression[0], torque, torque)
-        estimator["in_flight"][0] = np.roll(estimator["in_flight"][0], 1)
-        estimator["in_flight"][0, 0] = torque
+        send(regression, estimator, torque)
         a = (torque + pushed - 0.01 * v) / mass
         y, v = y + PERIOD * v + 0.5 * PERIOD**2 * a, v + PERIOD * a
     return lightness(regression[0], 3e-4)
@@ -96,9 +101,7 @@ def test_another_hand_is_another_mass() -> None:
         mass = 3.6e-3 if j < 100 else 2e-4
         torque = 0.4 if j % 40 < 3 else 0.0
         learn(regression[0], estimator[0], COUNT * round(y / COUNT), mass_known(regression))
-        predict_regression(regression[0], torque, torque)
-        estimator["in_flight"][0] = np.roll(estimator["in_flight"][0], 1)
-        estimator["in_flight"][0, 0] = torque
+        send(regression, estimator, torque)
         a = torque / mass
         y, v = y + PERIOD * v + 0.5 * PERIOD**2 * a, v + PERIOD * a
     assert lightness(regression[0], 3e-4)[0] == pytest.approx(1.0 / 2e-4, rel=0.1)
@@ -115,9 +118,7 @@ def test_swing_against_friction_tells_the_mass(mass: float) -> None:
         learn(regression[0], estimator[0], COUNT * round(y / COUNT), known)
         found, deviation = lightness(regression[0], known)
         known = 1.0 / max(found, 200.0)
-        predict_regression(regression[0], torque, torque)
-        estimator["in_flight"][0] = np.roll(estimator["in_flight"][0], 1)
-        estimator["in_flight"][0, 0] = torque
+        send(regression, estimator, torque)
         y, v, _ = advance(plant[0], y, v, torque, 0.0, PERIOD)
     assert known == pytest.approx(mass, rel=0.1)
     assert deviation < 0.15 * found

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.signal import cont2discrete
+from test_regression import send
 
 from canwall.walls import (
     ESTIMATOR,
@@ -28,7 +29,6 @@ from canwall.walls.regression import (
     REGRESSION,
     learn,
     lightness,
-    predict_regression,
     reset_regression,
     set_regression,
 )
@@ -147,9 +147,7 @@ def test_regression_finds_the_load_behind_the_shaft(load: float, hz: float) -> N
         for torque in torques.tolist():
             mass = 1.0 / max(lightness(regression[0], 3e-4)[0], 200.0) + regression["rotor"][0]
             learn(regression[0], estimator[0], COUNT * round(x[0] / COUNT), mass)
-            predict_regression(regression[0], torque, torque)
-            estimator["in_flight"][0] = np.roll(estimator["in_flight"][0], 1)
-            estimator["in_flight"][0, 0] = torque
+            send(regression, estimator, torque)
             x = phi @ x + gamma * torque
         found.append(1.0 / lightness(regression[0], 3e-4)[0])
     assert found[0] == pytest.approx(load, rel=0.25)
