@@ -1,6 +1,7 @@
 """Fixtures for all tests: rigs and programs that end with the test, and one recorded run.
 
-Reports unmarked tests that are `slow` by the rule in pyproject.toml.
+Reports unmarked tests that are `slow` by the rule in pyproject.toml, and a test that ends its process
+as an internal error: scripts/test has no second run for it.
 """
 
 import contextlib
@@ -86,8 +87,25 @@ class Tiers:
                 terminalreporter.write_line(f"{took:.1f} s {name}")
 
 
+class Crashes:
+    """Tells a test that ends its process from one that fails."""
+
+    def __init__(self) -> None:
+        self._any = False
+
+    @pytest.hookimpl(optionalhook=True)
+    def pytest_handlecrashitem(self) -> None:
+        self._any = True
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_sessionfinish(self, session: pytest.Session) -> None:
+        if self._any:
+            session.exitstatus = pytest.ExitCode.INTERNAL_ERROR
+
+
 def pytest_configure(config: pytest.Config) -> None:
     config.pluginmanager.register(Tiers())
+    config.pluginmanager.register(Crashes())
 
 
 @pytest.fixture(autouse=True)
