@@ -1,7 +1,7 @@
 """Fixtures for all tests: rigs and programs that end with the test, and one recorded run.
 
-Reports unmarked tests that are `slow` by the rule in pyproject.toml, and a test that ends its process
-as an internal error: scripts/test has no second run for it.
+Reports unmarked tests that are `slow` by the rule in pyproject.toml. A test that ends its process
+makes the exit code that of an internal error: scripts/test has no second run for it.
 """
 
 import contextlib

@@ -640,7 +640,7 @@ def test_late_rpdos_end_the_run(make_rig: RigFactory, ahead: int) -> None:
         ": RPDOs after the next SYNC for 30 cycles, limits.late_cycles = 30: the machine is too "
         "slow for bus.cycle_s"
     )
-    # Not at the cycle itself: a machine that stands still moves its SYNCs, and the count begins anew.
+    # A machine that stands still moves its SYNCs, and the count begins anew.
     before = [counts[j] for j in counts if j < outcome.trip_cycle]
     assert before[-30:] == list(range(30))
     assert max(before) == 29
