@@ -25,6 +25,7 @@ _SLOW = SLOW | UNTIL_STOPPED
 def _assert_told(run: Canwall, what: str) -> None:
     """Assert that the run reports what failed and what that means, in one line each."""
     assert run.wait() == 1
+    assert len(run.errors) == 2, run.errors
     failed, left = run.errors
     assert failed == f"canwall: the bus failed: {what}"
     assert left.startswith("canwall: the drive did not confirm that it is disabled (node 5: ")

@@ -15,6 +15,11 @@ export class ContactPlot {
   #depths = new CalmRange(5, 4000);
   #forces = new CalmRange(0.1, 4000);
   #highest = { depth: 0, force: 0 };
+  // The lines so far, in the scale that they were drawn in; of the running contact up to a point.
+  #layer = new OffscreenCanvas(1, 1);
+  #scale = "";
+  #drawn = 0;
+  #latest = "";
 
   constructor(place, caption) {
     this.caption = caption;
@@ -52,6 +57,7 @@ export class ContactPlot {
   clear() {
     this.#count = 0;
     this.#earlier = [];
+    this.#scale = this.#latest = "";
   }
 
   #begin() {
@@ -70,6 +76,7 @@ export class ContactPlot {
     }
     this.#count = 0;
     this.#highest = { depth: 0, force: 0 };
+    this.#scale = "";
   }
 
   #kept() {
@@ -80,46 +87,55 @@ export class ContactPlot {
     this.reach.depth = this.#depths.take(this.#highest.depth, milliseconds);
     this.reach.force = this.#forces.take(this.#highest.force, milliseconds);
     const line = known(this.stiffness) ? this.stiffness : NaN;
-    this.caption.textContent = known(line) ? `${digits(line, 3)} N·m/rad` : "";
+    const latest = [this.#count, this.reach.depth, this.reach.force, line].join();
+    if (latest === this.#latest) return;
+    this.#latest = latest;
+    const caption = known(line) ? `${digits(line, 3)} N·m/rad` : "";
+    if (this.caption.textContent !== caption) this.caption.textContent = caption;
     this.plot.draw([[0, this.reach.depth], [line * 0, line * this.reach.depth * 1e-3]]);
   }
 
   #loops(u) {
-    const { ctx, bbox } = u;
-    const x0 = u.valToPos(0, "x", true);
-    const y0 = u.valToPos(0, "y", true);
-    const dx = u.valToPos(1, "x", true) - x0;
-    const dy = u.valToPos(1, "y", true) - y0;
-    ctx.save();
-    ctx.beginPath();
-    ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
-    ctx.clip();
-    ctx.lineJoin = "round";
-    ctx.setLineDash([]); // of the referent
-    ctx.strokeStyle = colours.muted;
-    ctx.lineWidth = devicePixelRatio;
-    ctx.globalAlpha = 0.45;
-    for (const { depth, force } of this.#earlier) {
-      ctx.beginPath();
-      for (let i = 0; i < depth.length; i++) ctx.lineTo(x0 + dx * depth[i], y0 + dy * force[i]);
-      ctx.stroke();
+    const { left, top, width, height } = u.bbox;
+    const x0 = u.valToPos(0, "x", true) - left;
+    const y0 = u.valToPos(0, "y", true) - top;
+    const dx = u.valToPos(1, "x", true) - left - x0;
+    const dy = u.valToPos(1, "y", true) - top - y0;
+    const scale = [width, height, x0, y0, dx, dy, colours.force, colours.muted].join();
+    const ctx = this.#layer.getContext("2d");
+    if (scale !== this.#scale) {
+      this.#scale = scale;
+      this.#layer.width = width; // clears it
+      this.#layer.height = height;
+      this.#drawn = 0;
+      ctx.lineJoin = "round";
+      ctx.strokeStyle = colours.muted;
+      ctx.lineWidth = devicePixelRatio;
+      ctx.globalAlpha = 0.45;
+      for (const { depth, force } of this.#earlier) {
+        ctx.beginPath();
+        for (let i = 0; i < depth.length; i++) ctx.lineTo(x0 + dx * depth[i], y0 + dy * force[i]);
+        ctx.stroke();
+      }
+      ctx.globalAlpha = 1;
+      ctx.strokeStyle = colours.force;
+      ctx.lineWidth = 2 * devicePixelRatio;
     }
-    ctx.globalAlpha = 1;
-    ctx.strokeStyle = colours.force;
-    ctx.lineWidth = 2 * devicePixelRatio;
-    ctx.beginPath();
     const [begin, end] = this.#kept();
-    for (let i = begin; i < end; i++) {
-      ctx.lineTo(x0 + dx * this.#depth[i % KEPT], y0 + dy * this.#force[i % KEPT]);
-    }
-    ctx.stroke();
-    if (end > begin) {
-      const last = (end - 1) % KEPT;
+    const x = (i) => x0 + dx * this.#depth[i % KEPT];
+    const y = (i) => y0 + dy * this.#force[i % KEPT];
+    if (end > this.#drawn) {
       ctx.beginPath();
-      ctx.arc(x0 + dx * this.#depth[last], y0 + dy * this.#force[last], 5 * devicePixelRatio, 0, 7);
-      ctx.fillStyle = colours.force;
-      ctx.fill();
+      for (let i = Math.max(begin, this.#drawn - 1); i < end; i++) ctx.lineTo(x(i), y(i));
+      ctx.stroke();
+      this.#drawn = end;
     }
-    ctx.restore();
+    u.ctx.drawImage(this.#layer, left, top);
+    if (end > begin) {
+      u.ctx.beginPath();
+      u.ctx.arc(left + x(end - 1), top + y(end - 1), 5 * devicePixelRatio, 0, 7);
+      u.ctx.fillStyle = colours.force;
+      u.ctx.fill();
+    }
   }
 }

@@ -50,6 +50,7 @@ let run = { state: "none" };
 let settings = null;
 let contacts = [];
 let marks = [];
+let status = null; // to be shown in the next frame
 let awaited = false; // a frame that draws what has come
 let frames = 0;
 let view = "live";
@@ -74,7 +75,8 @@ link.addEventListener("contact_points", ({ detail }) => {
   renew();
 });
 link.addEventListener("status", ({ detail }) => {
-  showStatus(detail);
+  status = detail;
+  renew();
   stop.beatTimeout = detail.beat_timeout_s ?? 0;
   at("beat-watch").setAttribute("aria-checked", stop.beatTimeout > 0);
   at("recording").hidden = !detail.recording;
@@ -119,6 +121,7 @@ function showRun(next) {
   run = next;
   stop.running = ["attached", "starting"].includes(run.state);
   scene.running = stop.running;
+  showLatest.shown = -Infinity;
   renew();
   if (another) forget();
   if (another || begins) stop.reset();
@@ -128,7 +131,10 @@ function showRun(next) {
   at("begin-title").textContent = { ended: "The run has ended", failed: "The run failed" }[run.state] ?? "No run in progress";
   if (run.text) at("begin-text").textContent = run.text;
   if (idle) at("recording").hidden = true;
-  if (idle) showChatter({});
+  if (idle) {
+    status = null;
+    showChatter({});
+  }
   if (idle) loadConfigurations();
   showState(run.state, {
     none: "no run", starting: "starting …", attached: `run ${run.name}`, ended: "run ended", failed: "run failed",
@@ -196,7 +202,10 @@ async function start() {
   at("start").disabled = false;
 }
 
-/** Ask for a frame that draws the latest: as often as the server sends, and not without anything new. */
+/**
+ * Ask for a frame that draws the latest: as often as the server sends, and not without anything new.
+ * Texts change in these frames as well, since the browser composes the page anew for each change.
+ */
 function renew() {
   if (awaited || view !== "live") return;
   awaited = true;
@@ -212,16 +221,20 @@ function draw(now) {
   scene.draw(now);
   for (const plot of plots) plot.draw(now);
   contact.draw(now);
+  if (status) showStatus(status);
+  status = null;
+  if (now - showLatest.shown >= TEXT_MS) showLatest(now);
 }
 draw.begun = 0;
 
-function showLatest() {
+function showLatest(now) {
+  showLatest.shown = now;
   const latest = (name) => (stop.running ? (history.lowest(column(name)) + history.highest(column(name))) / 2 : NaN);
   showKeyValues({
     y: latest("y"), force: latest("force"), stiffness: latest("stiffness_in_force"), radius: settings?.handle_radius_m,
   });
 }
-setInterval(showLatest, TEXT_MS);
+showLatest.shown = -Infinity;
 setInterval(() => {
   at("f-page").textContent = `${Math.round(frames / 2)} frames/s`;
   frames = 0;

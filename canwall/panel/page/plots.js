@@ -1,7 +1,8 @@
 // Plots over time as bands from the lowest to the highest value, so that no peak is lost.
 
-import { colours, onTheme } from "./theme.js";
+import { hatch } from "./hatch.js";
 import { CalmRange, fixed } from "./numbers.js";
+import { colours, onTheme } from "./theme.js";
 
 const FONT = '13px system-ui, "Segoe UI", Roboto, "Noto Sans", sans-serif';
 
@@ -49,43 +50,53 @@ export class Plot {
   }
 }
 
-/** Lines of a band: two series, and the fill between them. */
+/** A band: of its two series, the highest values draw the outline of both. */
 function bandSeries(bands) {
-  const series = [{}];
-  const fills = [];
-  bands.forEach(({ colour, dash, width = 1.5 }) => {
-    const line = { stroke: colours[colour], width, dash, points: { show: false }, spanGaps: false };
-    series.push(line, { ...line });
-    fills.push({ series: [series.length - 1, series.length - 2], fill: colours[colour] + "55" });
-  });
-  return { series, bands: fills };
+  return [{}, ...bands.flatMap(({ colour, dash, width = 1.5 }) => [
+    { paths: () => null, points: { show: false } },
+    {
+      paths: bandPath, stroke: colours[colour], fill: colours[colour] + "55", width, dash, points: { show: false },
+    },
+  ])];
 }
 
-/** Hatches the wall's inside below 0, or above. */
+/** The outline, in parts where values are missing: the highest from left to right, the lowest back. */
+function bandPath(u, series, first, last) {
+  const [t, low, high] = [u.data[0], u.data[series - 1], u.data[series]];
+  const x0 = u.valToPos(0, "x", true);
+  const y0 = u.valToPos(0, "y", true);
+  const dx = u.valToPos(1, "x", true) - x0;
+  const dy = u.valToPos(1, "y", true) - y0;
+  const x = (i) => x0 + dx * t[i];
+  const y = (value) => y0 + dy * value;
+  const fill = new Path2D();
+  // Dashes that go there and back would fill each other's gaps.
+  const stroke = u.series[series].dash ? new Path2D() : fill;
+  for (let begin = first, end; begin <= last; begin = end + 1) {
+    for (end = begin; end <= last && Number.isFinite(high[end]); end++);
+    if (end === begin) continue;
+    fill.moveTo(x(begin), y(high[begin]));
+    for (let i = begin + 1; i < end; i++) fill.lineTo(x(i), y(high[i]));
+    for (let i = end - 1; i >= begin; i--) fill.lineTo(x(i), y(low[i]));
+    if (stroke === fill) continue;
+    for (const values of [low, high]) {
+      stroke.moveTo(x(begin), y(values[begin]));
+      for (let i = begin + 1; i < end; i++) stroke.lineTo(x(i), y(values[i]));
+    }
+  }
+  return { stroke, fill };
+}
+
+/** Hatches the wall's inside below 0. */
 function hatchWall(u, column) {
   const { ctx, bbox } = u;
   const surface = u.valToPos(0, "y", true);
   const bottom = bbox.top + bbox.height;
   if (column !== "y" || surface >= bottom) return;
-  const ratio = devicePixelRatio;
   ctx.save();
-  ctx.beginPath();
-  ctx.rect(bbox.left, surface, bbox.width, bottom - surface);
-  ctx.fillStyle = colours.wall;
-  ctx.fill();
-  ctx.clip();
+  hatch(ctx, bbox.left, surface, bbox.width, bottom - surface);
   ctx.strokeStyle = colours["wall-edge"];
-  ctx.globalAlpha = 0.35;
-  ctx.lineWidth = ratio;
-  ctx.beginPath();
-  const depth = bottom - surface;
-  for (let x = bbox.left - depth; x < bbox.left + bbox.width; x += 11 * ratio) {
-    ctx.moveTo(x, bottom);
-    ctx.lineTo(x + depth, surface);
-  }
-  ctx.stroke();
-  ctx.globalAlpha = 1;
-  ctx.lineWidth = 1.5 * ratio;
+  ctx.lineWidth = 1.5 * devicePixelRatio;
   ctx.beginPath();
   ctx.moveTo(bbox.left, surface);
   ctx.lineTo(bbox.left + bbox.width, surface);
@@ -100,7 +111,7 @@ function hatchWall(u, column) {
  */
 export function bandOptions({ bands, scales, column, labels = true, decimals, cursor, hooks = {}, time }) {
   return () => ({
-    ...bandSeries(bands),
+    series: bandSeries(bands),
     padding: [8, 24, labels ? 0 : 8, 0],
     scales: { x: { time: false, ...scales.x }, y: { auto: false, ...scales.y } },
     axes: [
@@ -131,10 +142,11 @@ export class RollingPlot {
     this.#factor = factor;
     this.#above = new CalmRange(least);
     this.#below = new CalmRange(0.15 * least);
+    this.t = new Float64Array(history.capacity);
     this.scaled = columns.flatMap(() => [0, 1].map(() => new Float32Array(history.capacity)));
     this.top = least;
     this.bottom = -least;
-    const empty = [new Float64Array(0), ...this.scaled.map((each) => each.subarray(0, 0))];
+    const empty = [this.t, ...this.scaled].map((each) => each.subarray(0, 0));
     this.plot = new Plot(place, bandOptions({
       bands,
       column: bands[0].colour === "position" ? "y" : "",
@@ -153,21 +165,31 @@ export class RollingPlot {
     const { history } = this;
     this.now = history.now || 0;
     const [begin, end] = history.since(this.now - this.window);
-    const n = end - begin;
-    const data = [history.t.subarray(begin, end)];
+    // As many points as pixels: of several in one, the lowest and the highest. They stay together
+    // as they move.
+    const together = Math.ceil((end - begin) / (this.plot.u?.bbox.width || end - begin || 1));
+    const first = (begin + history.count - end) % together;
+    let n = 0;
     let highest = 0;
     let lowest = 0;
-    this.columns.forEach((column, c) => {
-      const low = this.scaled[2 * c];
-      const high = this.scaled[2 * c + 1];
-      for (let i = 0; i < n; i++) {
-        low[i] = history.low[column][begin + i] * this.#factor;
-        high[i] = history.high[column][begin + i] * this.#factor;
-        if (low[i] < lowest) lowest = low[i];
-        if (high[i] > highest) highest = high[i];
-      }
-      data.push(low.subarray(0, n), high.subarray(0, n));
-    });
+    for (let i = begin; i < end; n++) {
+      const next = Math.min(i + together - (n ? 0 : first), end);
+      this.columns.forEach((column, c) => {
+        let low = NaN;
+        let high = NaN;
+        for (let k = i; k < next; k++) {
+          if (low !== low || history.low[column][k] < low) low = history.low[column][k];
+          if (high !== high || history.high[column][k] > high) high = history.high[column][k];
+        }
+        this.scaled[2 * c][n] = low *= this.#factor;
+        this.scaled[2 * c + 1][n] = high *= this.#factor;
+        if (low < lowest) lowest = low;
+        if (high > highest) highest = high;
+      });
+      this.t[n] = history.t[next - 1];
+      i = next;
+    }
+    const data = [this.t, ...this.scaled].map((each) => each.subarray(0, n));
     this.top = this.#above.take(highest, milliseconds);
     this.bottom = -this.#below.take(Math.max(-lowest, 0.15 * this.top), milliseconds);
     this.plot.draw(data);

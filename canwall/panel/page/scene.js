@@ -1,5 +1,6 @@
 // The drawing: the handle on its axis with the wall, and the contact magnified.
 
+import { hatch } from "./hatch.js";
 import { COLUMNS } from "./link.js";
 import { CalmRange, digits, fixed, known, nice } from "./numbers.js";
 import { colours, onTheme, reducedMotion } from "./theme.js";
@@ -86,8 +87,6 @@ export class Scene {
     ctx.arc(x, y, reach * 1.0, face, face + sign * 0.5, sign < 0);
     ctx.arc(x, y, reach * 0.52, face + sign * 0.5, face, sign > 0);
     ctx.closePath();
-    ctx.fillStyle = colours.wall;
-    ctx.fill();
     ctx.save();
     ctx.clip();
     hatch(ctx, x, y - reach, reach, 2 * reach);
@@ -147,14 +146,7 @@ export class Scene {
     ctx.fillStyle = colours.raised;
     ctx.fill();
     ctx.clip();
-    ctx.fillStyle = colours.wall;
-    ctx.fillRect(left, surface, width, height);
-    ctx.save();
-    ctx.beginPath();
-    ctx.rect(left, surface, width, height);
-    ctx.clip();
-    hatch(ctx, left, surface, width, height);
-    ctx.restore();
+    hatch(ctx, left, surface, width, top + height - surface);
     ctx.strokeStyle = colours["wall-edge"];
     ctx.lineWidth = 3;
     ctx.beginPath();
@@ -256,19 +248,6 @@ export class Scene {
     ctx.fill();
     return length;
   }
-}
-
-function hatch(ctx, left, top, width, height) {
-  ctx.strokeStyle = colours["wall-edge"];
-  ctx.globalAlpha = 0.35;
-  ctx.lineWidth = 1.2;
-  ctx.beginPath();
-  for (let x = left - height; x < left + width; x += 14) {
-    ctx.moveTo(x, top + height);
-    ctx.lineTo(x + height, top);
-  }
-  ctx.stroke();
-  ctx.globalAlpha = 1;
 }
 
 function label(ctx, text, x, y, size, colour, weight = 400, halo = null) {
