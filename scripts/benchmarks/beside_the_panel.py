@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 from canwall import config
 from canwall.record.columns import TIMING_COLUMNS
 
-_TURNS, _SECONDS = 3, 20.0
+_TURNS, _SECONDS = 7, 20.0
 #: From the start of a run until its wall and its page can be looked at [s], and for how long.
 _BEGINS_S, _LOOKS_S = 4.0, 12.0
 _TICKS = os.sysconf("SC_CLK_TCK")
