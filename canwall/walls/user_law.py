@@ -43,6 +43,11 @@ def load_law(path: Path, function: str) -> Law:
     except (Exception, SystemExit) as error:  # whatever the user's file does when it is run
         raise UnknownLawError(f"{where}: {type(error).__name__}: {_gist(error)}") from None
     written = getattr(module, function, None)
+    if isinstance(written, Law):
+        raise UnknownLawError(
+            f"{where}: in a file the function stands without @canwall.law; options are the "
+            "dictionary OPTIONS beside it"
+        )
     if not isinstance(written, FunctionType):
         raise UnknownLawError(f"{where}: the file has no such function")
     return make_law(where, written, getattr(module, "OPTIONS", {}))

@@ -156,6 +156,13 @@ def test_helpers_constants_memory_and_plain_integers(write: Write) -> None:
     ("text", "complaint"),
     [
         ("def other(wall):\n    return 0.0\n", "the file has no such function"),
+        (
+            "from canwall.walls.user_law import make_law\n"
+            "def other(wall):\n    return 0.0\n"
+            "mine = make_law('mine', other, {})\n",
+            "in a file the function stands without @canwall.law; options are the dictionary "
+            "OPTIONS beside it",
+        ),
         ("def mine(wall)\n    return 0.0\n", "SyntaxError: expected ':' (mine.py, line 1)"),
         ("import nowhere\n", "ModuleNotFoundError: No module named 'nowhere'"),
         ("def mine(wall):\n    pass\n", "line 2: returns None; a law returns a number"),
