@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 #: Samples of a piece: long enough for friction to move many counts, short enough for the residuals
 #: of forces outside the model not to add up.
 PIECE = 40
+#: Slowest motion whose direction counts [rad/s], and samples over which a coarse encoder tells it.
+_SLOWEST, _TOGETHER = 0.1, 4
 
 
 def steady_pieces(position: Array, period: float, step: float) -> tuple[NDArray[np.int64], Array]:
@@ -28,20 +30,22 @@ def steady_pieces(position: Array, period: float, step: float) -> tuple[NDArray[
         period: SYNC period [s].
         step: Step of the encoder [rad].
     """
-    moved = np.diff(position)
-    jolts = np.diff(moved)
-    # Between two samples the velocity differs from the mean by less than it changes over them.
+    # Of a coarse encoder, the velocity over some samples, as far as it can be told from none.
+    n = min(math.ceil(2.0 * step / (_SLOWEST * period)), _TOGETHER)
+    moved = (position[n:] - position[:-n]) / n
+    jolts = moved[n:] - moved[:-n]
+    # Between the samples the velocity differs from the mean by less than it changes over them.
     power = uniform_filter1d(np.nan_to_num(jolts) ** 2, 2 * PIECE, mode="nearest")
     jolt = np.sqrt(np.maximum(power, 0.0))
-    least = np.maximum(np.append(jolt, jolt[-1]), max(2.0 * step, 0.1 * period))
+    least = np.maximum(np.pad(jolt, (0, n), "edge"), max(2.0 * step / n, _SLOWEST * period))
     found: list[int] = []
     signs: list[float] = []
     for sign in (1.0, -1.0):
         steady = np.nan_to_num(sign * moved, nan=-1.0) > least
         edges = np.flatnonzero(np.diff(np.concatenate([[0], steady.astype(int), [0]])))
         for begin, end in edges.reshape(-1, 2):
-            # `end` moves have one position more.
-            pieces = range(int(begin), int(end) + 2 - PIECE, PIECE)
+            # `end` moves have n positions more.
+            pieces = range(int(begin), int(end) + n + 1 - PIECE, PIECE)
             found += pieces
             signs += [sign] * len(pieces)
     order = np.argsort(found)

@@ -49,6 +49,17 @@ def test_pieces_keep_their_direction() -> None:
         assert not begin <= 100 < begin + PIECE
 
 
+def test_coarse_encoder_tells_the_direction_over_some_samples() -> None:
+    """At most 2 rad/s are 1.3 of its steps a period: no single period tells the way."""
+    step = 2.0 * math.pi / 4096
+    time = np.arange(2000) * PERIOD
+    true = np.sin(2.0 * time)
+    first, sign = steady_pieces(np.floor(true / step) * step, PERIOD, step)
+    assert len(first) > 20
+    for begin, way in zip(first, sign, strict=True):
+        assert (way * np.diff(true[begin : begin + PIECE]) > 0.0).all()
+
+
 def test_handle_that_hardly_moves_tells_nothing() -> None:
     torque = 0.1 * np.random.default_rng(2).normal(size=4000)
     with pytest.raises(UntellingDataError, match="moved too little"):
