@@ -25,7 +25,7 @@ function spread(value, unit, relative) {
 
 /** The lamp; nothing is known without a run. */
 export function showChatter({ chatter, chatter_hz: frequency, felt_ripple_n: ripple }) {
-  at("lamp").dataset.on = Boolean(chatter);
+  at("lamp").dataset.on = chatter ?? "unknown";
   const words = known(frequency) && frequency >= 1 ? `${fixed(frequency, 0)} Hz` : "chatter";
   say("k-chatter", chatter === undefined ? "–" : chatter ? words : "quiet");
   say("k-ripple", `felt ripple ${known(ripple) ? `${digits(ripple, 2)} N` : "–"}`);
