@@ -4,6 +4,7 @@ import inspect
 import itertools
 import json
 import types
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin
@@ -29,16 +30,16 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     return ["| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines]
 
 
-class _Generated(SphinxDirective):
+class _Generated(SphinxDirective, ABC):
     """A directive whose text is made here."""
 
     def run(self) -> list[nodes.Node]:
         text = "\n".join(self.lines())
         return self.parse_text_to_nodes(text, allow_section_headings=True)
 
+    @abstractmethod
     def lines(self) -> Iterator[str]:
         """Markdown."""
-        raise NotImplementedError
 
 
 class Commands(_Generated):

@@ -2,6 +2,7 @@
 
 import { Plot, axis } from "./plots.js";
 import { CalmRange, digits, fixed, known } from "./numbers.js";
+import { setText } from "./readings.js";
 import { colours } from "./theme.js";
 
 const KEPT = 8192; // points of the running contact
@@ -90,8 +91,7 @@ export class ContactPlot {
     const latest = [this.#count, this.reach.depth, this.reach.force, line].join();
     if (latest === this.#latest) return;
     this.#latest = latest;
-    const caption = known(line) ? `${digits(line, 3)} N·m/rad` : "";
-    if (this.caption.textContent !== caption) this.caption.textContent = caption;
+    setText(this.caption, known(line) ? `${digits(line, 3)} N·m/rad` : "");
     this.plot.draw([[0, this.reach.depth], [line * 0, line * this.reach.depth * 1e-3]]);
   }
 
@@ -130,6 +130,10 @@ export class ContactPlot {
       ctx.stroke();
       this.#drawn = end;
     }
+    u.ctx.save(); // uPlot keeps in mind what it has set
+    u.ctx.beginPath();
+    u.ctx.rect(left, top, width, height);
+    u.ctx.clip();
     u.ctx.drawImage(this.#layer, left, top);
     if (end > begin) {
       u.ctx.beginPath();
@@ -137,5 +141,6 @@ export class ContactPlot {
       u.ctx.fillStyle = colours.force;
       u.ctx.fill();
     }
+    u.ctx.restore();
   }
 }

@@ -9,7 +9,7 @@ import { beginKeys, beginTabs } from "./keys.js";
 import { COLUMNS, Link } from "./link.js";
 import { digits } from "./numbers.js";
 import { RollingPlot } from "./plots.js";
-import { showChatter, showKeyValues, showMarks, showStatus } from "./readings.js";
+import { setText, showChatter, showKeyValues, showMarks, showStatus } from "./readings.js";
 import { Recorded } from "./recorded.js";
 import { Scene } from "./scene.js";
 import { Stop } from "./stop.js";
@@ -130,12 +130,12 @@ function showRun(next) {
   document.querySelector(".controls").inert = idle;
   at("begin-title").textContent = { ended: "The run has ended", failed: "The run failed" }[run.state] ?? "No run in progress";
   if (run.text) at("begin-text").textContent = run.text;
-  if (idle) at("recording").hidden = true;
   if (idle) {
+    at("recording").hidden = true;
     status = null;
     showChatter({});
+    loadConfigurations();
   }
-  if (idle) loadConfigurations();
   showState(run.state, {
     none: "no run", starting: "starting …", attached: `run ${run.name}`, ended: "run ended", failed: "run failed",
   }[run.state] ?? run.state);
@@ -155,7 +155,7 @@ function forget() {
 function showState(state, text) {
   const place = at("run-state");
   if (place.dataset.state !== state) place.dataset.state = state;
-  if (at("run-state-text").textContent !== text) at("run-state-text").textContent = text;
+  setText(at("run-state-text"), text);
 }
 
 function phase({ phase: name, ended }) {

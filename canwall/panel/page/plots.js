@@ -60,18 +60,25 @@ function bandSeries(bands) {
   ])];
 }
 
-/** The outline, in parts where values are missing: the highest from left to right, the lowest back. */
 function bandPath(u, series, first, last) {
-  const [t, low, high] = [u.data[0], u.data[series - 1], u.data[series]];
+  const band = { t: u.data[0], low: u.data[series - 1], high: u.data[series] };
+  return outline(u, band, { first, last, dashed: Boolean(u.series[series].dash) });
+}
+
+/**
+ * Paths of a band, in parts where values are missing: the highest from left to right, the lowest back.
+ * @returns {{fill: Path2D, stroke: Path2D}}
+ */
+export function outline(u, { t, low, high }, { first = 0, last = t.length - 1, dashed = false, shift = 0, factor = 1 }) {
   const x0 = u.valToPos(0, "x", true);
   const y0 = u.valToPos(0, "y", true);
   const dx = u.valToPos(1, "x", true) - x0;
   const dy = u.valToPos(1, "y", true) - y0;
-  const x = (i) => x0 + dx * t[i];
-  const y = (value) => y0 + dy * value;
+  const x = (i) => x0 + dx * (t[i] + shift);
+  const y = (value) => y0 + dy * factor * value;
   const fill = new Path2D();
   // Dashes that go there and back would fill each other's gaps.
-  const stroke = u.series[series].dash ? new Path2D() : fill;
+  const stroke = dashed ? new Path2D() : fill;
   for (let begin = first, end; begin <= last; begin = end + 1) {
     for (end = begin; end <= last && Number.isFinite(high[end]); end++);
     if (end === begin) continue;

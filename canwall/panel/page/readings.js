@@ -4,10 +4,12 @@ import { digits, fixed, known, seconds } from "./numbers.js";
 
 const at = (id) => document.getElementById(id);
 
-function say(id, text) {
-  const place = at(id);
+/** Set a text only if it is another: the browser composes the page anew for each that is set. */
+export function setText(place, text) {
   if (place.textContent !== text) place.textContent = text;
 }
+
+const say = (id, text) => setText(at(id), text);
 
 /** The large values below the drawing. */
 export function showKeyValues({ y, force, stiffness, radius }) {

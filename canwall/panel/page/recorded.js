@@ -2,7 +2,7 @@
 
 import { COLUMNS, signals } from "./link.js";
 import { digits, fixed, joules, known } from "./numbers.js";
-import { Plot, bandOptions, decimals } from "./plots.js";
+import { Plot, bandOptions, decimals, outline } from "./plots.js";
 import { SweepMap } from "./sweep.js";
 import { define, table } from "./tables.js";
 import { colours } from "./theme.js";
@@ -64,12 +64,10 @@ function drawBand(u, { t, low, high }, column, factor, shift) {
   ctx.strokeStyle = ctx.fillStyle = colours.active;
   ctx.lineWidth = 1.5 * devicePixelRatio;
   ctx.setLineDash([7 * devicePixelRatio, 4 * devicePixelRatio]);
-  ctx.beginPath();
-  for (let i = 0; i < t.length; i++) ctx.lineTo(u.valToPos(t[i] + shift, "x", true), u.valToPos(high[column][i] * factor, "y", true));
-  for (let i = t.length - 1; i >= 0; i--) ctx.lineTo(u.valToPos(t[i] + shift, "x", true), u.valToPos(low[column][i] * factor, "y", true));
-  ctx.stroke();
+  const paths = outline(u, { t, low: low[column], high: high[column] }, { dashed: true, shift, factor });
+  ctx.stroke(paths.stroke);
   ctx.globalAlpha = 0.3;
-  ctx.fill();
+  ctx.fill(paths.fill);
   ctx.restore();
 }
 
