@@ -17,6 +17,7 @@ from canwall.drive import objects as od
 from canwall.walls import (
     BANK,
     ESTIMATOR,
+    LATCH,
     MAX_DELAY,
     TENSION,
     WALL,
@@ -29,8 +30,10 @@ from canwall.walls import (
     hand_damping,
     reset_bank,
     reset_estimator,
+    reset_latch,
     set_bank,
     set_estimator,
+    set_latch,
     set_plant,
     set_referent,
     stiffest_wall,
@@ -126,6 +129,7 @@ CYCLE = np.dtype(
         ("guard", GUARD, (1,)),
         ("estimator", ESTIMATOR, (1,)),
         ("bank", BANK, (1,)),
+        ("latch", LATCH, (1,)),
         ("shaft", "f8", (4,)),  # fields of ElasticShaft; zero: rigid
         # The estimator for TPDOs that are a cycle late since one was missing, and the one for a
         # TPDO that was lost, both without the bank: while they are being compared, how much
@@ -288,6 +292,8 @@ def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None
         delay,
         margin,
     )
+    probe = 1.5 * cycle["bank"][0, 0]["regression"]["probe"].item()
+    set_latch(cycle["latch"][0, 0], period, settings.drive.drive_cycle_s, count, probe)
     _bound_by_shaft(cycle)
     _reset(cycle, float(cycle["oriented"][0]))
 
@@ -324,7 +330,7 @@ def _bound_by_shaft(cycle: NDArray[np.void]) -> None:
     n = bank["count"].item()
     for i in range(n):
         mass = math.exp(bank["log_lightest"] + i * bank["log_step"])
-        gain = tuple(bank["gain"][:, i].tolist())
+        gain = tuple(bank["paces"][0, :3, i].tolist())
         loop = WallLoop(mass, bank["viscous"][i].item(), gain, *closing)
         bank["stiffest"][i] = stiffest_wall(shaft, loop)
     if n:
@@ -353,6 +359,7 @@ def _reset(cycle: NDArray[np.void], oriented: float) -> None:
     """Reset the estimator at a position [rad]; TPDOs are what its delay takes them for."""
     reset_estimator(cycle["estimator"][0], oriented)
     reset_bank(cycle["bank"][0], oriented)
+    reset_latch(cycle["latch"][0, 0])
     cycle["compares_lag"] = False
     cycle["lag"] = 0
 

@@ -17,6 +17,7 @@ from canwall.units import to_per_mille
 from canwall.walls import (
     acting_force,
     actuation_state,
+    at_sync,
     change_plant,
     correct,
     correct_bank,
@@ -30,6 +31,7 @@ from canwall.walls import (
     put_in_force,
     set_applied_force,
     set_model,
+    set_pace,
     stand_still,
     start_lagging,
     stiffest,
@@ -116,10 +118,11 @@ def _set_wall_inputs(cycle: Record, rendered: Record, sample: float, due: bool) 
 
 
 @compiled
-def _identify_operator(cycle: Record) -> None:
+def _identify_operator(cycle: Record, sample: float) -> None:
     """Let the bank learn from the sample; the walls' laws get the mass that it finds."""
     bank, estimator = cycle.bank[0], cycle.estimator[0]
-    if correct_bank(bank, estimator, cycle.oriented):
+    set_pace(bank, cycle.rendered[0].wall[0].stiffness)
+    if correct_bank(bank, estimator, sample):
         wall = cycle.rendered[0].wall[0]
         change_plant(wall, estimator.mass, estimator.viscous)
         if bank.regression[0].rotor > 0.0:
@@ -381,9 +384,10 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
         compare_position(cycle, cycle.counts - before, missed)
         if cycle.compares_lag:
             _compare_lag(cycle)
-        correct(estimator, cycle.oriented)
+        sample = at_sync(cycle.latch[0], estimator, cycle.j, cycle.oriented)
+        correct(estimator, sample)
         if cycle.bank[0].adapts:
-            _identify_operator(cycle)
+            _identify_operator(cycle, sample)
     else:
         begins_lag = _may_begin_to_lag(cycle)
         note_missing_sample(estimator)

@@ -12,6 +12,7 @@ from canwall.walls.bank import (
     predict_bank,
     reset_bank,
     set_bank,
+    set_pace,
     stiffest,
     with_probe,
 )
@@ -49,6 +50,7 @@ from canwall.walls.interface import (
     set_plant,
     set_referent,
 )
+from canwall.walls.latch import LATCH, at_sync, reset_latch, set_latch
 from canwall.walls.layers import TENSION, set_applied_force, wall_force
 from canwall.walls.registry import LAWS, declare_law, find_law, is_declared
 from canwall.walls.shaft import ElasticShaft, WallLoop, stiffest_wall
@@ -58,6 +60,7 @@ __all__ = [
     "DEADBEAT",
     "ESTIMATOR",
     "HORIZON",
+    "LATCH",
     "LAWS",
     "MAX_DELAY",
     "MAX_FILTERS",
@@ -69,6 +72,7 @@ __all__ = [
     "WallLoop",
     "acting_force",
     "actuation_state",
+    "at_sync",
     "call_law",
     "change_plant",
     "clear_memory",
@@ -90,10 +94,13 @@ __all__ = [
     "put_in_force",
     "reset_bank",
     "reset_estimator",
+    "reset_latch",
     "set_applied_force",
     "set_bank",
     "set_estimator",
+    "set_latch",
     "set_model",
+    "set_pace",
     "set_plant",
     "set_referent",
     "stand_still",

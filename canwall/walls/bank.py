@@ -1,7 +1,8 @@
-"""The operator identified in the cycle, and a bank of steady-state Kalman filters over the mass.
+"""Operator and delay identified in the cycle: a bank of steady-state Kalman filters over the mass.
 
 State and model in force are interpolated between the two filters next to the mass that a regression
-finds (`regression`). Coulomb friction is left to the bias force d̂ (theory, section 8).
+finds (`regression`), at the delay that it finds. Coulomb friction is left to the bias force d̂
+(theory, section 8).
 
 The bank works on an estimator in its steady state and hands over state and model to it. In a gap
 of samples, and until the estimator has settled again, the estimator goes on alone and the bank
@@ -15,23 +16,32 @@ from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
 from canwall.physics import zoh
-from canwall.walls.estimator import MAX_DELAY, KalmanModel, kalman_model, set_model
+from canwall.walls.estimator import (
+    MAX_DELAY,
+    KalmanModel,
+    kalman_model,
+    set_model,
+    set_model_delay,
+)
 from canwall.walls.regression import (
     REGRESSION,
     begin_regression,
     forget_mass,
     learn,
-    lightness,
     predict_regression,
     probe,
     put_probe_in_flight,
     reset_regression,
     set_regression,
+    solve,
 )
 from canwall.walls.shaft import ElasticShaft
 
 #: Largest number of filters.
 MAX_FILTERS = 24
+
+#: Stiffnesses for which filters have gains.
+_PACES = 8
 
 #: A bank, in the order of the masses. Gains, covariances and transitions are made beforehand:
 #: nothing of a Riccati equation is left for the cycle.
@@ -47,6 +57,11 @@ BANK = np.dtype(
         # [y, ẏ, d] of each filter, and its gain.
         ("state", "f8", (3, MAX_FILTERS)),
         ("gain", "f8", (3, MAX_FILTERS)),
+        # Gains, `with_velocity` and `equal_samples` for softer and softer walls, each half as stiff
+        # as the one before; stiffness of the first, and number of the one in force.
+        ("paces", "f8", (_PACES, 6, MAX_FILTERS)),
+        ("steadiest", "f8"),
+        ("pace", "i8"),
         # What a correction of the velocity says of position and force, and the number of equal
         # samples from which on there is one.
         ("with_velocity", "f8", (2, MAX_FILTERS)),
@@ -60,6 +75,13 @@ BANK = np.dtype(
         ("phi", "f8", (4, MAX_FILTERS)),
         ("older", "f8", (2, MAX_FILTERS)),
         ("newer", "f8", (2, MAX_FILTERS)),
+        # Both as parabolas over the share of the period before that instant, c₀ + c₁·s + c₂·s².
+        ("older_by_share", "f8", (3, 2, MAX_FILTERS)),
+        ("newer_by_share", "f8", (3, 2, MAX_FILTERS)),
+        # D as told, with the margin of the filters, and as it is in force [periods].
+        ("told", "f8"),
+        ("delay", "f8"),
+        ("delay_in_force", "f8"),
         # Models for an estimator that loses samples.
         ("covariance", "f8", (MAX_FILTERS, 3, 3)),
         ("transition", "f8", (MAX_FILTERS, 3, 3)),
@@ -87,11 +109,16 @@ _FOLLOWED = 0.6
 #: grows with mass and bandwidth; but under a filter that is slow against the wall a handle that
 #: breaks loose slips far, and friction and the bias force hunt.
 _AS_QUICK, _STEADINESS = 3.0, 0.52
+#: K·T²/m from which on a filter is at its steadiest, and the power of the stiffness with which its
+#: bandwidth rises below, up to the lightest one's: on a soft wall noise is felt less, and a filter
+#: that is slower than the wall makes a heavy hand bounce.
+_STEADIEST, _QUICKENING = 0.5, 1.0 / 4.5
 #: Share of half a count within which a reading does not contradict the prediction of a heavy hand,
 #: whose motion between two samples is known better than that. A light one needs each correction.
 _WITHIN = 0.8
 #: Time constants of a filter for which samples have to be equal before its velocity is bounded by
-#: them, and the most samples: a filter that is slower than that finds rest by itself.
+#: them, and the most samples: a filter that is slower than that finds rest by itself. (Bounded by
+#: anything but the covariance that belongs to its gain, a filter of a handle at rest diverges.)
 _EQUAL, _EQUAL_SAMPLES = 8.0, 32.0
 #: Time constant at which a light hand's damping equals its inertia [s].
 _HAND_S = 1.5e-3
@@ -135,47 +162,83 @@ def set_bank(
     n = len(masses)
     if not 3 <= n <= MAX_FILTERS:
         raise ValueError(f"a bank has 3 to {MAX_FILTERS} filters, not {n}")
-    fraction = delay - math.floor(delay)
     bank["adapts"], bank["count"] = True, n
     bank["log_lightest"] = math.log(masses[0])
     bank["log_step"] = math.log(masses[-1] / masses[0]) / (n - 1)
     bank["spring"] = spring
     bank["forgotten"] = round(_FORGOTTEN_S / period)
-    told = max(delay - margin, math.floor(delay))  # of the same torques in flight
-    set_regression(bank["regression"][0, 0], float(masses[0]), period, count, told, shaft)
+    bank["delay"], bank["told"] = delay, delay - margin
+    lightest = float(masses[0])
+    set_regression(bank["regression"][0, 0], lightest, period, count, delay - margin, shaft)
     bank["stiffest"], bank["within"] = np.inf, 0.0
+    bank["steadiest"] = _STEADIEST * masses[-1] / period**2
     bank["viscous"][0, :n] = viscous
     for i in range(n):
-        walk = force_walk
+        plant = float(masses[i]), float(viscous[i]), spring, period
+        walk, heavier, slower = force_walk, float(masses[i] / masses[0]), 1.0
         if shaft is None:
-            heavier = float(masses[i] / masses[0])
-            slower = min(1.0, _AS_QUICK / heavier)
-            walk *= heavier * slower ** (3.0 * _STEADINESS)  # by the cube of the bandwidth
-            bank["within"][0, i] = 0.5 * _WITHIN * (1.0 - slower) * abs(count)
-        model = kalman_model(masses[i], viscous[i], spring, period, count, walk)
+            slower = min(1.0, _AS_QUICK / heavier) ** _STEADINESS
+            walk *= heavier * slower**3  # by the cube of the bandwidth
+            bank["within"][0, i] = (
+                0.5 * _WITHIN * (1.0 - min(1.0, _AS_QUICK / heavier)) * abs(count)
+            )
+        model = kalman_model(*plant, count, walk)
+        quickest = kalman_model(*plant, count, walk / slower**3)
         _set_filter(bank[0], i, model)
-        _set_rest(bank[0], i, model, period)
-        phi, _ = zoh(masses[i], viscous[i], spring, period)
-        _, before = zoh(masses[i], viscous[i], spring, fraction * period)
-        phi_after, after = zoh(masses[i], viscous[i], spring, (1.0 - fraction) * period)
-        bank["phi"][0, :, i] = phi.ravel()
-        bank["older"][0, :, i] = phi_after @ before
-        bank["newer"][0, :, i] = after
+        _set_paces(bank[0], i, model, quickest, slower, period)
+        _set_torques(bank[0], i, *plant)
+
+
+def _set_paces(
+    bank: np.void,
+    i: int,
+    model: KalmanModel,
+    quickest: KalmanModel,
+    slower: float,
+    period: float,
+) -> None:
+    """Write the gains of a filter and what rest tells it, up to being as quick as the lightest."""
+    steadiest = bank["steadiest"] * math.exp(bank["log_step"] * (i + 1 - bank["count"]))
+    steady = np.concatenate([model.gain, _rest(model, period)])
+    quick = np.concatenate([quickest.gain, _rest(quickest, period)])
+    for k in range(_PACES):
+        softer = max(steadiest / bank["steadiest"] * 2.0**k, 1.0)
+        quicker = min(softer**_QUICKENING, 1.0 / slower)
+        share = math.log(quicker) / -math.log(slower) if slower < 1.0 else 0.0
+        bank["paces"][k, :, i] = steady * (quick / steady) ** share
+
+
+def _set_torques(
+    bank: np.void, i: int, mass: float, viscous: float, spring: float, period: float
+) -> None:
+    """Write the transition of a filter, and what torques do before and after the actuation."""
+    phi, _ = zoh(mass, viscous, spring, period)
+    bank["phi"][:, i] = phi.ravel()
+    shares = np.array([0.0, 0.5, 1.0])
+    older, newer = np.zeros((3, 2)), np.zeros((3, 2))
+    for k, share in enumerate(shares.tolist()):
+        _, before = zoh(mass, viscous, spring, share * period)
+        phi_after, newer[k] = zoh(mass, viscous, spring, (1.0 - share) * period)
+        older[k] = phi_after @ before
+    to_parabola = np.linalg.inv(np.vander(shares, increasing=True))
+    bank["older_by_share"][:, :, i] = to_parabola @ older
+    bank["newer_by_share"][:, :, i] = to_parabola @ newer
 
 
 def _set_filter(bank: np.void, i: int, model: KalmanModel) -> None:
-    bank["gain"][:, i] = model.gain
     bank["covariance"][i], bank["transition"][i] = model.covariance, model.transition
     bank["scale"][i], bank["force_noise"][i] = model.scale, model.force_noise
 
 
-def _set_rest(bank: np.void, i: int, model: KalmanModel, period: float) -> None:
-    """Write what equal samples say of a filter, by its covariance after a sample."""
+def _rest(model: KalmanModel, period: float) -> NDArray[np.float64]:
+    """Return what equal samples say of a filter, by its covariance after a sample.
+
+    Corrections of position and force for one of the velocity, and the number of samples.
+    """
     scale, prior = model.scale, model.covariance
     after = prior - np.outer(model.gain / scale * scale[0], prior[0])
-    bank["with_velocity"][:, i] = after[[0, 2], 1] / after[1, 1] * scale[[0, 2]] / scale[1]
-    equal = _EQUAL * scale[0] / (scale[1] * period)
-    bank["equal_samples"][i] = equal if equal <= _EQUAL_SAMPLES else math.inf
+    with_velocity = after[[0, 2], 1] / after[1, 1] * scale[[0, 2]] / scale[1]
+    return np.append(with_velocity, _EQUAL * scale[0] / (scale[1] * period))
 
 
 def reset_bank(bank: NDArray[np.void], y: float) -> None:
@@ -187,6 +250,12 @@ def reset_bank(bank: NDArray[np.void], y: float) -> None:
     bank["mass"] = np.exp(bank["log_lightest"])
     bank["at_rest"] = 0
     bank["sampled"], bank["equal"] = y, 0
+    # The first cycle sets what depends on the delay and, until then as for the stiffest wall, on
+    # the stiffness.
+    bank["delay_in_force"], bank["pace"] = -1.0, -1
+    steadiest = bank["paces"][0, 0]
+    bank["gain"], bank["with_velocity"] = steadiest[:3], steadiest[3:5]
+    bank["equal_samples"] = np.where(steadiest[5] <= _EQUAL_SAMPLES, steadiest[5], np.inf)
 
 
 @compiled
@@ -197,6 +266,7 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
     """
     n = bank.count
     state, gain = bank.state, bank.gain
+    bank.regression[0].delay = estimator.told
     if not estimator.settled:
         for i in range(n):
             state[0, i], state[1, i], state[2, i] = estimator.y, estimator.v, estimator.d
@@ -211,6 +281,7 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
         state[2, i] += gain[2, i] * residual
     _bound_velocity(bank, y_sample)
     changed = _identify(bank, estimator, y_sample)
+    changed |= _follow_delay(bank, estimator)
     k = min(int(bank.place), n - 2)
     share = bank.place - k
     estimator.y = state[0, k] + share * (state[0, k + 1] - state[0, k])
@@ -221,6 +292,41 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
         set_model(estimator, bank.mass, viscous, bank.spring)
         _set_covariance(bank, estimator, int(bank.place + 0.5))
     return changed
+
+
+@compiled
+def set_pace(bank: Record, stiffness: float) -> None:
+    """Make the filters as quick as a wall of this stiffness wants; call before `correct_bank`."""
+    pace = _PACES - 1
+    if stiffness > 0.0:
+        pace = min(max(int(math.log2(bank.steadiest / stiffness)), 0), pace)
+    if pace == bank.pace:
+        return
+    bank.pace = pace
+    values = bank.paces[pace]
+    for i in range(bank.count):
+        for c in range(3):
+            bank.gain[c, i] = values[c, i]
+        bank.with_velocity[0, i], bank.with_velocity[1, i] = values[3, i], values[4, i]
+        bank.equal_samples[i] = values[5, i] if values[5, i] <= _EQUAL_SAMPLES else math.inf
+
+
+@compiled
+def _follow_delay(bank: Record, estimator: Record) -> bool:
+    """Put the delay that was found in force; return True if another one was."""
+    lag = estimator.told - bank.told  # of samples that are late
+    delay = min(max(bank.delay + lag + bank.regression[0].excess, 0.0), float(MAX_DELAY))
+    if delay == bank.delay_in_force:
+        return False
+    bank.delay_in_force = delay
+    set_model_delay(estimator, delay)
+    share = delay - int(delay)
+    older, newer = bank.older_by_share, bank.newer_by_share
+    for k in range(2):
+        for i in range(bank.count):
+            bank.older[k, i] = older[0, k, i] + share * (older[1, k, i] + share * older[2, k, i])
+            bank.newer[k, i] = newer[0, k, i] + share * (newer[1, k, i] + share * newer[2, k, i])
+    return True
 
 
 @compiled
@@ -271,7 +377,7 @@ def _torque_acted(estimator: Record) -> bool:
 @compiled
 def _follow(bank: Record) -> bool:
     """Move the mass in force towards the likeliest one; return True if it moved."""
-    likeliest, deviation = lightness(bank.regression[0], bank.mass)
+    likeliest, deviation = solve(bank.regression[0], bank.mass)
     bank.spread = deviation / max(likeliest, deviation)
     if likeliest > 0.0:
         # Rotor and load together.
@@ -321,7 +427,7 @@ def _set_covariance(bank: Record, estimator: Record, i: int) -> None:
     estimator.scale[:] = bank.scale[i]
     estimator.force_noise = bank.force_noise[i]
     for c in range(3):
-        estimator.steady_gain[c] = estimator.gain[c] = bank.gain[c, i]
+        estimator.steady_gain[c] = estimator.gain[c] = bank.paces[0, c, i]
 
 
 @compiled
@@ -333,7 +439,7 @@ def predict_bank(bank: Record, estimator: Record, force: float) -> None:
     n = estimator.delay_periods
     older = estimator.in_flight[n]
     newer = force if n == 0 else estimator.in_flight[n - 1]
-    predict_regression(bank.regression[0], older, newer)
+    predict_regression(bank.regression[0], estimator.in_flight, force)
     put_probe_in_flight(bank.regression[0], force)
     state, phi = bank.state, bank.phi
     for i in range(bank.count):

@@ -6,6 +6,7 @@ x̂[j+1] = Φ·x̂[j] + Γ·(f + d̂) for each period up to j+D. The bias force 
 observable, so it need not be known.
 """
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -54,7 +55,7 @@ ESTIMATOR = np.dtype(
         ("viscous", "f8"),
         ("coulomb", "f8"),
         ("delay_periods", "i8"),
-        ("margin", "f8"),  # part of the delay that the model alone has [periods]
+        ("told", "f8"),  # D as told, without what the model has added to it [periods]
         ("full", _HOLD, (1,)),
         ("before", _HOLD, (1,)),
         ("after", _HOLD, (1,)),
@@ -87,6 +88,7 @@ class KalmanModel(NamedTuple):
     scale: NDArray[np.float64]
 
 
+@functools.lru_cache(maxsize=1024)  # a bank has two a filter, and a sweep sets it for each strike
 def kalman_model(
     mass: float, viscous: float, spring: float, period: float, count: float, force_walk: float
 ) -> KalmanModel:
@@ -145,7 +147,7 @@ def set_estimator(
         raise ValueError(f"a delay of {delay:g} periods is not between 0 and {MAX_DELAY}")
     whole = math.floor(delay)
     fraction = delay - whole
-    estimator["delay_periods"], estimator["margin"] = whole, margin
+    estimator["delay_periods"], estimator["told"] = whole, delay - margin
     estimator["mass"], estimator["viscous"] = mass, viscous
     estimator["coulomb"] = coulomb
     kalman = kalman_model(mass, viscous, spring, period, count, force_walk)
@@ -175,6 +177,16 @@ def set_model(estimator: Record, mass: float, viscous: float, spring: float) -> 
     _set_hold(estimator.full[0], mass, viscous, spring)
     _set_hold(estimator.before[0], mass, viscous, spring)
     _set_hold(estimator.after[0], mass, viscous, spring)
+
+
+@compiled
+def set_model_delay(estimator: Record, delay: float) -> None:
+    """Exchange the delay D of the model [periods]; call `set_model` after it."""
+    whole = int(delay)
+    period = estimator.full[0].duration
+    estimator.delay_periods = whole
+    estimator.before[0].duration = (delay - whole) * period
+    estimator.after[0].duration = (1.0 - delay + whole) * period
 
 
 @compiled
@@ -343,6 +355,7 @@ def start_lagging(lagging: Record, force: float) -> None:
     period longer. force: as in `predict`, from the period without a sample.
     """
     lagging.delay_periods += 1
+    lagging.told += 1.0
     _put_in_flight(lagging, force)
 
 
@@ -350,6 +363,7 @@ def start_lagging(lagging: Record, force: float) -> None:
 def end_lag(estimator: Record) -> None:
     """Advance an estimator whose samples lag by a period, as the next one does no longer."""
     estimator.delay_periods -= 1
+    estimator.told -= 1.0
     note_missing_sample(estimator)
     if estimator.gap < _LONGEST_GAP:
         _predict_covariance(estimator)
@@ -405,12 +419,11 @@ def predict_open_loop(estimator: Record, force: float) -> None:
 def acting_force(estimator: Record, in_flight: NDArray[np.float64]) -> float:
     """Return the mean from this sample to the next of forces in flight; call after `predict`.
 
+    They act at the delay as told: what is found of it in the motion is for the model alone.
     in_flight: as `ESTIMATOR` has them, newest first, or a part of them.
     """
-    share = estimator.before[0].duration / estimator.full[0].duration
-    delay = max(estimator.delay_periods + share - estimator.margin, 0.0)
-    n = int(delay)
-    share = delay - n
+    n = int(estimator.told)
+    share = estimator.told - n
     force = in_flight[n]
     if share > 0.0:
         force = share * in_flight[n + 1] + (1.0 - share) * force

@@ -1,12 +1,15 @@
-"""The mass at the handle, by a regression on what an observer does not expect.
+"""The mass at the handle and the delay, by a regression on what an observer does not expect.
 
 One fast observer, with a bias of its own, follows the positions without any torque, the torque
-alone, the velocity alone, and its direction alone. What it does not expect of the positions is −1/m
-times the same of the torque, plus b/m times that of the velocity, plus f_c/m times that of the
-direction (Coulomb friction), plus something steady from a hand whose force changes steadily. What
-changes more slowly (the operator's push, friction in one direction) is in none of them.
+alone, the velocity alone, its direction alone, and the difference that a later torque makes. What
+it does not expect of the positions is −1/m times the same of the torque, −δ/m times that of the
+difference, plus b/m times that of the velocity, plus f_c/m times that of the direction (Coulomb
+friction), plus something steady from a hand whose force changes steadily. What changes more slowly
+(the operator's push, friction in one direction) is in none of them. δ is the delay beyond the one
+told. It is the drive's: what was learned of it is kept when the hand goes.
 
-On an elastic shaft it is the load that is observed, by what the rotor tells of it.
+On an elastic shaft it is the load that is observed, by what the rotor tells of it, and the delay is
+as told.
 
 The torque is the wall's, or a probe's: shortly before a contact the handle is pushed to and fro by
 a few counts, so that a light hand is told from a heavy one before the wall acts.
@@ -30,11 +33,17 @@ REGRESSION = np.dtype(
         ("period", "f8"),
         ("resolution", "f8"),  # one count [rad]
         ("lightest", "f8"),  # smallest mass that there may be, beyond an elastic shaft
-        ("delay_share", "f8"),  # of a period, up to the instant of actuation
+        # Delay as told; beyond that, as found, and its standard deviation [periods]; precision and
+        # mean of what was known of it before the present hand.
+        ("delay", "f8"),
+        ("excess", "f8"),
+        ("excess_spread", "f8"),
+        ("excess_before", "f8", (2,)),
         # The observer of [y, ẏ, ÿ], its gain, and its state for positions, torque (of a unit mass),
-        # velocity and direction; what it does not expect of them at this sample, and one count.
+        # velocity, direction and the difference of a later torque; what it does not expect of them
+        # at this sample, and one count.
         ("gain", "f8", (3,)),
-        ("observed", "f8", (3, 4)),
+        ("observed", "f8", (3, 5)),
         # Inertia of the rotor on an elastic shaft, 0: rigid, and compliance of the shaft over T²;
         # for a unit mass under the torque, the part of its next second difference that the last
         # period made, and the second difference; torque in the shaft and position behind it.
@@ -44,8 +53,9 @@ REGRESSION = np.dtype(
         ("bend", "f8"),
         ("shaft_torque", "f8"),
         ("load", "f8"),
-        ("surprise", "f8", (5,)),
-        ("information", "f8", (5, 5)),  # weighted sums of their products
+        ("surprise", "f8", (6,)),
+        ("information", "f8", (6, 6)),  # weighted sums of their products
+        ("normal", "f8", (6, 6)),  # the same with what is known before, as it is being solved
         ("noise", "f8"),  # mean square of what nothing explains [rad²]
         ("hand_torque", "f8"),  # surprise by a torque that changes as fast as a hand's
         ("samples", "f8", (_RECENT,)),  # the last ones, newest first [rad]
@@ -80,12 +90,17 @@ _STRONG = 4.0
 _UNTIMELY, _UNTIMELY_MOST = 0.1, 0.3
 #: Surprise that is explained by none, as a multiple of the noise.
 _UNEXPLAINED = 6.0
+#: Growth of the noise from one sample to the next that casts doubt on the samples before.
+_SUDDENLY = 1.5
 #: Share of what is known that is left after a sample that tells as much as those before, and after
 #: one that nothing explains: another hand, or a blow.
 _MEMORY, _DOUBTED = 0.98, 0.1
 #: Before the first torque: standard deviation of m₀/m about 1, with m₀ the lightest mass; mean and
 #: standard deviation of b/m [1/s]; standard deviation of what is steady [counts].
-_PRIOR_LIGHTNESS, _PRIOR_RATE, _PRIOR_RATE_DEVIATION, _PRIOR_STEADY = 0.7, 100.0, 150.0, 4.0
+_PRIOR_LIGHTNESS, _PRIOR_RATE, _PRIOR_RATE_DEVIATION, _PRIOR_STEADY = 0.7, 100.0, 300.0, 4.0
+#: Delay beyond the one told, before the first torque: standard deviation, and the most; what is
+#: added to the deviation from one hand to the next [periods].
+_PRIOR_EXCESS, _MOST_EXCESS, _EXCESS_CHANGES = 0.3, 0.5, 0.05
 #: Coulomb friction that there may be: standard deviation, and the most that explains a surprise
 #: [N·m].
 _FRICTION = 0.02
@@ -118,10 +133,10 @@ def set_regression(
     regression["rotor"] = shaft.rotor if shaft else 0.0
     regression["softness"] = 1.0 / (shaft.stiffness * period**2) if shaft else 0.0
     regression["lightest"] = lightest - regression["rotor"]
-    regression["delay_share"] = delay - math.floor(delay)
+    regression["delay"] = delay
     bandwidth = _OBSERVER_BEHIND_SHAFT_HZ if shaft else _OBSERVER_HZ
     regression["gain"] = gain = _observer_gain(bandwidth, period)
-    regression["surprise"][4] = abs(count)
+    regression["surprise"][5] = abs(count)
     regression["hand_torque"] = _HAND_RATE * period / gain[2]
     slower = round(_OBSERVER_HZ / bandwidth)
     regression["probe_samples"] = samples = slower * _PROBE_SAMPLES
@@ -141,11 +156,13 @@ def _observer_gain(bandwidth: float, period: float) -> NDArray[np.float64]:
 
 
 def reset_regression(regression: np.void, y: float) -> None:
-    """Begin at rest at y, with nothing known of the mass."""
+    """Begin at rest at y, with nothing known of mass and delay."""
     for name in ("observed", "information", "way", "steady", "probed", "probing", "probes"):
         regression[name] = 0
-    for name in ("begun", "bend", "shaft_torque"):
+    for name in ("begun", "bend", "shaft_torque", "excess"):
         regression[name] = 0.0
+    regression["excess_spread"] = _PRIOR_EXCESS
+    regression["excess_before"] = 1.0 / _PRIOR_EXCESS**2, 0.0
     regression["observed"][0, 0] = regression["load"] = y
     regression["samples"] = y
     regression["noise"] = (_QUANTISATION * regression["resolution"]) ** 2
@@ -165,7 +182,10 @@ def begin_regression(regression: Record, y: float) -> None:
 
 @compiled
 def forget_mass(regression: Record) -> None:
-    """Forget all that is known of the mass."""
+    """Forget all that is known of the mass; what it told of the delay is kept."""
+    spread = regression.excess_spread
+    regression.excess_before[0] = 1.0 / (spread * spread + _EXCESS_CHANGES * _EXCESS_CHANGES)
+    regression.excess_before[1] = regression.excess
     regression.information[:] = 0.0
 
 
@@ -184,7 +204,7 @@ def learn(regression: Record, estimator: Record, y_sample: float, mass: float) -
     steps = _torque_steps(estimator) * regression.period * regression.period
     explained = _is_explained(regression, steps)
     _note_way(regression, y_sample, explained)
-    told = abs(regression.surprise[1]) / regression.hand_torque
+    told = abs(_torque_surprise(regression)) / regression.hand_torque
     if told <= 1.0:
         _note_noise(regression, mass)
     if not explained:
@@ -202,7 +222,7 @@ def learn(regression: Record, estimator: Record, y_sample: float, mass: float) -
 def _observe(regression: Record, y_sample: float) -> None:
     """Correct the observer: what it did not expect of the sample, of torque and of motion."""
     surprise, observed = regression.surprise, regression.observed
-    for c in range(4):
+    for c in range(5):
         surprise[c] = (y_sample if c == 0 else 0.0) - observed[0, c]
         for i in range(3):
             observed[i, c] += regression.gain[i] * surprise[c]
@@ -256,6 +276,12 @@ def _advance_load(regression: Record, y_sample: float) -> float:
 
 
 @compiled
+def _torque_surprise(regression: Record) -> float:
+    """Return the surprise by the torque, as late as it was found to be."""
+    return regression.surprise[1] + regression.excess * regression.surprise[4]
+
+
+@compiled
 def _torque_steps(estimator: Record) -> float:
     """Return the sum of the last two steps of the torque that acted, without sign [N·m]."""
     steps = 0.0
@@ -269,7 +295,7 @@ def _torque_steps(estimator: Record) -> float:
 def _is_explained(regression: Record, steps: float) -> bool:
     """Return True if there is a mass for which the torque explains the motion."""
     rest = abs(regression.surprise[0]) - _UNEXPLAINED * math.sqrt(regression.noise)
-    torque = abs(regression.surprise[1]) + _UNTIMELY_MOST * steps
+    torque = abs(_torque_surprise(regression)) + _UNTIMELY_MOST * steps
     torque += _FRICTION * abs(regression.surprise[3])
     torque += _UNTIMELY_MOST * steps * regression.softness * regression.lightest
     return rest * regression.lightest <= torque
@@ -292,10 +318,14 @@ def _note_way(regression: Record, y_sample: float, explained: bool) -> None:
 
 @compiled
 def _note_noise(regression: Record, mass: float) -> None:
-    rest = regression.surprise[0] + regression.surprise[1] / mass
+    rest = regression.surprise[0] + _torque_surprise(regression) / mass
     square = min(rest * rest, _UNEXPLAINED * _UNEXPLAINED * regression.noise)
     noise = regression.noise + _NOISE_SHARE * (square - regression.noise)
-    regression.noise = max(noise, (_QUANTISATION * regression.resolution) ** 2)
+    noise = max(noise, (_QUANTISATION * regression.resolution) ** 2)
+    if noise > _SUDDENLY * regression.noise:
+        # What began a few samples ago was taken for an answer to the torque meanwhile.
+        _forget(regression, regression.noise / noise)
+    regression.noise = noise
 
 
 @compiled
@@ -306,68 +336,126 @@ def _add_information(regression: Record, untimely: float, mass: float) -> None:
     """
     r, information = regression.surprise, regression.information
     weight = 1.0 / (regression.noise + untimely * untimely)
-    rest = max(abs(r[0] + r[1] / mass) - _FRICTION / mass * abs(r[3]), 0.0)
+    torque = _torque_surprise(regression)
+    rest = max(abs(r[0] + torque / mass) - _FRICTION / mass * abs(r[3]), 0.0)
     if weight * rest * rest > _UNEXPLAINED * _UNEXPLAINED:
         _doubt(regression)
-    exchanged = min(1.0 - _MEMORY, weight * r[1] * r[1] / max(information[1, 1], 1e-300))
-    for i in range(5):
-        for c in range(5):
+    exchanged = min(1.0 - _MEMORY, weight * torque * torque / max(information[1, 1], 1e-300))
+    for i in range(6):
+        for c in range(6):
             information[i, c] = (1.0 - exchanged) * information[i, c] + weight * r[i] * r[c]
 
 
 @compiled
 def _doubt(regression: Record) -> None:
+    _forget(regression, _DOUBTED)
+
+
+@compiled
+def _forget(regression: Record, left: float) -> None:
     information = regression.information
-    for i in range(5):
-        for c in range(5):
-            information[i, c] *= _DOUBTED
+    for i in range(6):
+        for c in range(6):
+            information[i, c] *= left
 
 
 @compiled
-def lightness(regression: Record, mass: float) -> tuple[float, float]:
-    """Return the likeliest 1/m, of the load on an elastic shaft, and its standard deviation.
+def solve(regression: Record, mass: float) -> tuple[float, float]:
+    """Return 1/m, of the load on an elastic shaft, and its standard deviation; find the delay.
 
-    They are the least squares of r₀ + r₁·(1/m) − r₂·(b/m) − r₃·(f_c/m) − r₄·c, with what is known
-    before the first torque; c is what is steady. mass: the one in force, for the friction.
+    They are the least squares of r₀ + r₁·(1/m) − r₂·(b/m) − r₃·(f_c/m) + r₄·(δ/m) − r₅·c, with what
+    is known before the first torque; c is what is steady. mass: the one in force, for friction and
+    delay.
     """
-    s, lightest = regression.information, regression.lightest
-    steady = s[4, 4] + 1.0 / _PRIOR_STEADY**2
-    friction = s[3, 3] - s[3, 4] * s[3, 4] / steady + ((mass - regression.rotor) / _FRICTION) ** 2
-    of_lightness = (lightest / _PRIOR_LIGHTNESS) ** 2
-    of_rate = 1.0 / _PRIOR_RATE_DEVIATION**2
-    p11 = _left_of(s, 1, 1, steady, friction) + of_lightness
-    p12 = -_left_of(s, 1, 2, steady, friction)
-    p22 = _left_of(s, 2, 2, steady, friction) + of_rate
-    q1 = -_left_of(s, 0, 1, steady, friction) + of_lightness / lightest
-    q2 = _left_of(s, 0, 2, steady, friction) + of_rate * _PRIOR_RATE
-    determinant = p11 * p22 - p12 * p12
-    return (q1 * p22 - q2 * p12) / determinant, math.sqrt(p22 / determinant)
+    normal, lightest = regression.normal, regression.lightest
+    normal[:] = regression.information
+    mass -= regression.rotor
+    before = (lightest / _PRIOR_LIGHTNESS) ** 2
+    _add_knowledge(normal, 1, before, 1.0 / lightest)
+    _add_knowledge(normal, 2, 1.0 / _PRIOR_RATE_DEVIATION**2, -_PRIOR_RATE)
+    _add_knowledge(normal, 3, (mass / _FRICTION) ** 2, 0.0)
+    precision, excess = regression.excess_before[0], regression.excess_before[1]
+    _add_knowledge(normal, 4, precision * mass * mass, excess / mass)
+    _add_knowledge(normal, 5, 1.0 / _PRIOR_STEADY**2, 0.0)
+    _eliminate(normal, 5)
+    _eliminate(normal, 3)
+    _eliminate(normal, 2)
+    told = normal[4, 4]
+    precision = normal[1, 1] - normal[1, 4] * normal[1, 4] / told
+    lightness = -(normal[0, 1] - normal[1, 4] * normal[0, 4] / told) / precision
+    deviation = 1.0 / math.sqrt(precision)
+    if lightness > 0.0 and regression.rotor == 0.0:
+        excess = -(normal[0, 4] + normal[1, 4] * lightness) / (told * lightness)
+        regression.excess = min(max(excess, -_MOST_EXCESS), _MOST_EXCESS)
+        regression.excess_spread = _excess_spread(regression, lightness)
+    return mean_above_zero(lightness, deviation), deviation
 
 
 @compiled
-def _left_of(s: Record, i: int, c: int, steady: float, friction: float) -> float:
-    """Return what r₄ and r₃ leave of an element of the information: they are eliminated."""
-    i3, c3 = s[i, 3] - s[i, 4] * s[3, 4] / steady, s[c, 3] - s[c, 4] * s[3, 4] / steady
-    left: float = s[i, c] - s[i, 4] * s[c, 4] / steady - i3 * c3 / friction
-    return left
+def _add_knowledge(normal: Record, k: int, precision: float, value: float) -> None:
+    """Add to the normal equations that unknown k has this value."""
+    normal[k, k] += precision
+    normal[0, k] -= precision * value
+    normal[k, 0] = normal[0, k]
 
 
 @compiled
-def predict_regression(regression: Record, older: float, newer: float) -> None:
-    """Advance the observer by a period under the torques before and after the actuation."""
-    t, share, x = regression.period, regression.delay_share, regression.observed
+def _eliminate(normal: Record, k: int) -> None:
+    """Eliminate unknown k from the normal equations of the others."""
+    for i in range(6):
+        share = normal[i, k] / normal[k, k]
+        if i != k:
+            for c in range(6):
+                normal[i, c] -= share * normal[k, c]
+
+
+@compiled
+def _excess_spread(regression: Record, lightness: float) -> float:
+    """Return the standard deviation of the delay, whatever the mass is: of δ in δ·(1/m)."""
+    normal, excess = regression.normal, regression.excess
+    both = normal[1, 4] + excess * normal[4, 4]
+    of_mass = normal[1, 1] + excess * (normal[1, 4] + both)
+    told = max(normal[4, 4] - both * both / of_mass, 0.0) * lightness * lightness
+    return min(1.0 / math.sqrt(max(told, 1e-6)), _PRIOR_EXCESS)
+
+
+@compiled
+def mean_above_zero(mean: float, deviation: float) -> float:
+    """Return the mean of a normal distribution of which only what is above zero is possible."""
+    z = mean / deviation
+    if z < -6.0:
+        return deviation / -z
+    return mean + deviation * math.sqrt(2.0 / math.pi) * math.exp(-0.5 * z * z) / math.erfc(
+        -z / math.sqrt(2.0)
+    )
+
+
+@compiled
+def predict_regression(regression: Record, in_flight: NDArray[np.float64], force: float) -> None:
+    """Advance the observer by a period, at the end of which `force` will be in flight, too."""
+    t, x, excess = regression.period, regression.observed, regression.excess
+    delay = min(max(regression.delay + excess, 0.0), float(MAX_DELAY))
+    n = int(delay)
+    share = delay - n
     rest = 1.0 - share
+    older = in_flight[n]
+    newer = force if n == 0 else in_flight[n - 1]
     way = t * t * (share * (1.0 - 0.5 * share) * older + 0.5 * rest * rest * newer)
     speed = t * (share * older + rest * newer)
     if regression.rotor > 0.0:
         regression.bend = regression.begun + way
         regression.begun = t * speed - way
         return
-    for c in range(4):
+    for c in range(5):
         x[0, c] += t * x[1, c] + 0.5 * t * t * x[2, c]
         x[1, c] += t * x[2, c]
-    x[0, 1] += way
-    x[1, 1] += speed
+    # What the torque does changes with its delay by this; torque and delay are regressed on
+    # as they are at the delay that was told.
+    later_way, later_speed = t * t * rest * (older - newer), t * (older - newer)
+    x[0, 1] += way - excess * later_way
+    x[1, 1] += speed - excess * later_speed
+    x[0, 4] += later_way
+    x[1, 4] += later_speed
     y = regression.samples
     # In the middle of the coming period, extrapolated from the middles of the last two.
     v = (2.0 * y[0] - 3.0 * y[1] + y[2]) / t

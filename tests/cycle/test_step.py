@@ -683,6 +683,7 @@ def test_model_has_a_margin_of_the_delay_and_what_acted_has_none(
     if given is not None:
         keys["estimator.delay_margin_cycles"] = given
     wall = Wall(keys)
+    wall.cycle["bank"]["regression"]["excess_before"] = 1e18, 0.0  # it is as told
     estimator = wall.cycle["estimator"][0, 0]
     share = estimator["before"]["duration"] / wall.cycle["period"][0]
     assert estimator["delay_periods"] + share == pytest.approx(modelled)

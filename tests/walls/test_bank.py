@@ -1,5 +1,6 @@
 """The bank of filters that identifies the operator."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from canwall.walls import (
     ESTIMATOR,
     correct,
     correct_bank,
+    end_lag,
     hand_damping,
     note_missing_sample,
     predict,
@@ -23,6 +25,8 @@ from canwall.walls import (
     reset_estimator,
     set_bank,
     set_estimator,
+    set_pace,
+    start_lagging,
 )
 
 PERIOD, COUNT, WALK, DELAY = 1e-3, 4.8e-5, 0.02, 1.35
@@ -104,13 +108,64 @@ def walk_of(i: int) -> float:
 def test_state_is_that_of_the_matching_filter_alone(i: int) -> None:
     bank, estimator = bank_at(0.0)
     bank["within"] = 0.0
+    # With the delay as told.
+    bank["regression"]["excess_before"] = 1e18, 0.0
     play(bank, estimator, float(MASSES[i]), pulses(0.3))
     alone = np.zeros(1, ESTIMATOR)
     set_estimator(alone, MASSES[i], VISCOUS[i], 0.0, 0.0, PERIOD, COUNT, walk_of(i), DELAY)
     reset_estimator(alone, 0.0)
     play(None, alone, float(MASSES[i]), pulses(0.3))
-    np.testing.assert_allclose(bank["state"][0, :, i], [alone[n][0] for n in "yvd"], rtol=1e-9)
+    # What torques do is a parabola over the delay.
+    np.testing.assert_allclose(bank["state"][0, :, i], [alone[n][0] for n in "yvd"], rtol=2e-5)
     np.testing.assert_allclose(bank["gain"][0, :, i], alone["steady_gain"][0], rtol=1e-12)
+
+
+def test_filters_are_quicker_on_softer_walls() -> None:
+    """By K^(-1/4.5) below K·T²/m = 0.5, up to the lightest one's; gains as by their own Riccati."""
+    bank, _ = bank_at(0.0)
+    stiffest = 0.5 * MASSES[15] / PERIOD**2
+    for softer, i in ((1.0, 15), (4.0, 15), (64.0, 15), (16.0, 9), (64.0, 2)):
+        set_pace(bank[0], 0.99 * stiffest / softer)
+        of_its_own = softer * MASSES[i] / MASSES[15]
+        slower = max(1.0, MASSES[i] / MASSES[0] / 3.0) ** -0.52
+        quicker = min(max(of_its_own, 1.0) ** (1.0 / 4.5), 1.0 / slower)
+        walk = walk_of(i) * quicker**3
+        alone = np.zeros(1, ESTIMATOR)
+        set_estimator(alone, MASSES[i], VISCOUS[i], 0.0, 0.0, PERIOD, COUNT, walk, DELAY)
+        np.testing.assert_allclose(bank["gain"][0, :, i], alone["steady_gain"][0], rtol=0.1)
+
+
+def test_torques_act_at_the_delay_that_is_found() -> None:
+    bank, estimator = bank_at(0.0)
+    correct_bank(bank[0], estimator[0], 0.0)
+    for excess in (0.0, 0.2, 0.4, 0.9, -0.5):
+        bank["regression"]["excess"] = excess
+        correct_bank(bank[0], estimator[0], 0.0)
+        whole, share = divmod(DELAY + excess, 1.0)
+        assert estimator["delay_periods"][0] == whole
+        before = estimator["before"]["duration"][0, 0]
+        np.testing.assert_allclose(before, share * PERIOD, atol=1e-15)
+        for i in (0, 9, 15):
+            phi_after, newer = discrete(MASSES[i], VISCOUS[i], (1.0 - share) * PERIOD)
+            _, older = discrete(MASSES[i], VISCOUS[i], share * PERIOD)
+            older = phi_after @ older
+            for name, expected in (("newer", newer), ("older", older)):
+                assert np.all(np.abs(bank[name][0, :, i] - expected) < 2e-3 * (newer + older))
+
+
+def test_delay_that_is_found_adds_to_that_of_samples_that_lag() -> None:
+    bank, estimator = bank_at(0.0)
+    correct_bank(bank[0], estimator[0], 0.0)
+    for turn, late in ((start_lagging, 1.0), (lambda lagging, _: end_lag(lagging), 0.0)):
+        turn(estimator[0], 0.0)
+        estimator["settled"] = True
+        for excess in (0.1, 0.2):
+            bank["regression"]["excess"] = excess
+            correct_bank(bank[0], estimator[0], 0.0)
+            before = estimator["before"]["duration"][0, 0] / PERIOD
+            in_force = estimator["delay_periods"][0] + before
+            assert in_force == pytest.approx(DELAY + excess + late)
+            assert bank["regression"]["delay"][0, 0] == pytest.approx(DELAY + late)
 
 
 def test_reading_that_contradicts_nothing_leaves_a_heavy_hand_alone() -> None:
@@ -175,6 +230,23 @@ def test_velocity_is_projected_with_the_covariance() -> None:
         after = np.linalg.inv(np.linalg.inv(prior) + 12.0 * seen.T @ seen)
         expected = after[[0, 2], 1] / after[1, 1] * units[[0, 2]] / units[1]
         np.testing.assert_allclose(bank["with_velocity"][0, :, i], expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("stiffness", [2000.0, 100.0, 30.0, 5.0, 1.0])
+def test_no_filter_leaves_a_handle_at_rest(stiffness: float) -> None:
+    """Bounded by the covariance of another gain, some diverge within a second."""
+    bank, estimator = bank_at(0.0)
+    set_pace(bank[0], stiffness)
+    bank["state"][0, 1] = 0.05  # it has just come to rest
+    for j in range(2000):
+        torque = 0.1 + 0.02 * math.sin(0.05 * j)
+        correct(estimator[0], 0.0)
+        correct_bank(bank[0], estimator[0], 0.0)
+        predict_bank(bank[0], estimator[0], torque)
+        predict(estimator[0], torque)
+    y, v, _ = bank["state"][0, :, : len(MASSES)]
+    assert np.abs(y).max() < 2.0 * COUNT
+    assert np.abs(v).max() < 0.02
 
 
 def test_handle_that_sticks_is_known_to_rest() -> None:
