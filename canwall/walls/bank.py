@@ -167,9 +167,9 @@ def set_bank(
     bank["log_step"] = math.log(masses[-1] / masses[0]) / (n - 1)
     bank["spring"] = spring
     bank["forgotten"] = round(_FORGOTTEN_S / period)
-    bank["delay"], bank["told"] = delay, delay - margin
-    lightest = float(masses[0])
-    set_regression(bank["regression"][0, 0], lightest, period, count, delay - margin, shaft)
+    told = delay - margin
+    bank["delay"], bank["told"] = delay, told
+    set_regression(bank["regression"][0, 0], float(masses[0]), period, count, told, shaft)
     bank["stiffest"], bank["within"] = np.inf, 0.0
     bank["steadiest"] = _STEADIEST * masses[-1] / period**2
     bank["viscous"][0, :n] = viscous
@@ -177,11 +177,10 @@ def set_bank(
         plant = float(masses[i]), float(viscous[i]), spring, period
         walk, heavier, slower = force_walk, float(masses[i] / masses[0]), 1.0
         if shaft is None:
-            slower = min(1.0, _AS_QUICK / heavier) ** _STEADINESS
+            light = min(1.0, _AS_QUICK / heavier)
+            slower = light**_STEADINESS
             walk *= heavier * slower**3  # by the cube of the bandwidth
-            bank["within"][0, i] = (
-                0.5 * _WITHIN * (1.0 - min(1.0, _AS_QUICK / heavier)) * abs(count)
-            )
+            bank["within"][0, i] = 0.5 * _WITHIN * (1.0 - light) * abs(count)
         model = kalman_model(*plant, count, walk)
         quickest = kalman_model(*plant, count, walk / slower**3)
         _set_filter(bank[0], i, model)
@@ -250,12 +249,8 @@ def reset_bank(bank: NDArray[np.void], y: float) -> None:
     bank["mass"] = np.exp(bank["log_lightest"])
     bank["at_rest"] = 0
     bank["sampled"], bank["equal"] = y, 0
-    # The first cycle sets what depends on the delay and, until then as for the stiffest wall, on
-    # the stiffness.
+    # None of either: the first cycle sets what depends on them.
     bank["delay_in_force"], bank["pace"] = -1.0, -1
-    steadiest = bank["paces"][0, 0]
-    bank["gain"], bank["with_velocity"] = steadiest[:3], steadiest[3:5]
-    bank["equal_samples"] = np.where(steadiest[5] <= _EQUAL_SAMPLES, steadiest[5], np.inf)
 
 
 @compiled

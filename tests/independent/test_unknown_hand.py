@@ -52,8 +52,9 @@ def test_wall_is_stiff_and_quiet_in_every_hand(name: str) -> None:
     for strike in STRIKES[1::3]:
         s = bench.strike(hand, strike, stiffness, referent_damping=damping)
         assert judge(s)[0], strike
-        # Lighter where a slow strike tells little (0.68 for an arm), and never much heavier.
-        assert 0.65 * mass < s.mass[-1] < 1.2 * mass, strike
+        # A slow strike tells little of an arm, which then counts as lighter (0.68).
+        lightest = 0.65 if name == "arm" else 0.8
+        assert lightest * mass < s.mass[-1] < 1.2 * mass, strike
         assert not judge(standard.strike(hand, strike, stiffness))[0]
 
 

@@ -40,6 +40,7 @@ def bank_at(y: float) -> tuple[NDArray[np.void], NDArray[np.void]]:
     set_estimator(estimator, MASSES[0], VISCOUS[0], 0.0, 0.0, PERIOD, COUNT, WALK, DELAY)
     reset_estimator(estimator, y)
     reset_bank(bank, y)
+    set_pace(bank[0], 1e9)
     return bank, estimator
 
 
@@ -108,15 +109,20 @@ def walk_of(i: int) -> float:
 def test_state_is_that_of_the_matching_filter_alone(i: int) -> None:
     bank, estimator = bank_at(0.0)
     bank["within"] = 0.0
-    # With the delay as told.
+    # With the delay as told, and what torques do then.
     bank["regression"]["excess_before"] = 1e18, 0.0
+    phi_after, newer = discrete(MASSES[i], VISCOUS[i], 0.65 * PERIOD)
+    bank["older_by_share"], bank["newer_by_share"] = 0.0, 0.0
+    bank["older_by_share"][0, 0, :, i] = (
+        phi_after @ discrete(MASSES[i], VISCOUS[i], 0.35 * PERIOD)[1]
+    )
+    bank["newer_by_share"][0, 0, :, i] = newer
     play(bank, estimator, float(MASSES[i]), pulses(0.3))
     alone = np.zeros(1, ESTIMATOR)
     set_estimator(alone, MASSES[i], VISCOUS[i], 0.0, 0.0, PERIOD, COUNT, walk_of(i), DELAY)
     reset_estimator(alone, 0.0)
     play(None, alone, float(MASSES[i]), pulses(0.3))
-    # What torques do is a parabola over the delay.
-    np.testing.assert_allclose(bank["state"][0, :, i], [alone[n][0] for n in "yvd"], rtol=2e-5)
+    np.testing.assert_allclose(bank["state"][0, :, i], [alone[n][0] for n in "yvd"], rtol=1e-9)
     np.testing.assert_allclose(bank["gain"][0, :, i], alone["steady_gain"][0], rtol=1e-12)
 
 

@@ -77,15 +77,16 @@ def test_blow_tells_the_mass(mass: float) -> None:
     torques[40:43] = max(0.4, 400.0 * mass)
     found, deviation = play(mass, torques, np.zeros(60))
     assert found == pytest.approx(1.0 / mass, rel=0.1)
-    assert deviation < 0.6 * found
+    # Of the lightest a blow of 0.4 N·m leaves more open: its timing moves it by many counts.
+    assert deviation < (0.6 if mass == LIGHTEST else 0.3) * found
 
 
 def test_torque_that_answers_a_hand_tells_nothing() -> None:
     """A wall that gives way to none would look heavy."""
     push = -3.0 * PERIOD * np.arange(100)
     found, deviation = play(4e-4, -push, push)
-    # The mean of what there may be is a little lighter than what is expected.
-    assert found == pytest.approx(1.0 / LIGHTEST, rel=0.12)
+    # The mean of what there may be before the first torque.
+    assert found == pytest.approx(mean_above_zero(1.0 / LIGHTEST, 0.7 / LIGHTEST))
     assert deviation > 0.5 * found
 
 
