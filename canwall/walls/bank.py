@@ -62,6 +62,9 @@ BANK = np.dtype(
         ("paces", "f8", (_PACES, 6, MAX_FILTERS)),
         ("steadiest", "f8"),
         ("pace", "i8"),
+        # Samples for which a handle that moved is followed quickly, and those that are left.
+        ("lively", "i8"),
+        ("lively_left", "i8"),
         # What a correction of the velocity says of position and force, and the number of equal
         # samples from which on there is one.
         ("with_velocity", "f8", (2, MAX_FILTERS)),
@@ -113,6 +116,10 @@ _AS_QUICK, _STEADINESS = 3.0, 0.52
 #: bandwidth rises below, up to the lightest one's: on a soft wall noise is felt less, and a filter
 #: that is slower than the wall makes a heavy hand bounce.
 _STEADIEST, _QUICKENING = 0.5, 1.0 / 4.5
+#: Least way of a handle that moves [counts a sample], and the time after it for which all filters
+#: are as quick as the lightest [s]: noise is felt at rest alone, and a filter that is slow to find
+#: the push after a blow makes a heavy hand bounce.
+_MOVES, _LIVELY_S = 1.5, 0.1
 #: Share of half a count within which a reading does not contradict the prediction of a heavy hand,
 #: whose motion between two samples is known better than that. A light one needs each correction.
 _WITHIN = 0.8
@@ -166,7 +173,7 @@ def set_bank(
     bank["log_lightest"] = math.log(masses[0])
     bank["log_step"] = math.log(masses[-1] / masses[0]) / (n - 1)
     bank["spring"] = spring
-    bank["forgotten"] = round(_FORGOTTEN_S / period)
+    bank["forgotten"], bank["lively"] = round(_FORGOTTEN_S / period), round(_LIVELY_S / period)
     told = delay - margin
     bank["delay"], bank["told"] = delay, told
     set_regression(bank["regression"][0, 0], float(masses[0]), period, count, told, shaft)
@@ -248,7 +255,7 @@ def reset_bank(bank: NDArray[np.void], y: float) -> None:
     bank["place"], bank["spread"] = 0.0, 0.0
     bank["mass"] = np.exp(bank["log_lightest"])
     bank["at_rest"] = 0
-    bank["sampled"], bank["equal"] = y, 0
+    bank["sampled"], bank["equal"], bank["lively_left"] = y, 0, 0
     # None of either: the first cycle sets what depends on them.
     bank["delay_in_force"], bank["pace"] = -1.0, -1
 
@@ -291,9 +298,14 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
 
 @compiled
 def set_pace(bank: Record, stiffness: float) -> None:
-    """Make the filters as quick as a wall of this stiffness wants; call before `correct_bank`."""
+    """Make the filters as quick as handle and stiffness want; call before `correct_bank`."""
+    regression = bank.regression[0]
+    if abs(regression.way) >= _MOVES * regression.resolution:
+        bank.lively_left = bank.lively
+    elif bank.lively_left > 0:
+        bank.lively_left -= 1
     pace = _PACES - 1
-    if stiffness > 0.0:
+    if stiffness > 0.0 and bank.lively_left == 0:
         pace = min(max(int(math.log2(bank.steadiest / stiffness)), 0), pace)
     if pace == bank.pace:
         return
@@ -448,6 +460,6 @@ def predict_bank(bank: Record, estimator: Record, force: float) -> None:
 def with_probe(bank: Record, wall: Record, force: float) -> float:
     """Return the force of a law, and where that is zero the torque of a probe, unless it holds."""
     if force == 0.0 and not bank.holds:
-        return probe(bank.regression[0], wall)
+        return probe(bank.regression[0], wall, bank.mass)
     bank.regression[0].probed = 0
     return force

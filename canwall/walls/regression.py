@@ -12,7 +12,8 @@ On an elastic shaft it is the load that is observed, by what the rotor tells of 
 as told.
 
 The torque is the wall's, or a probe's: shortly before a contact the handle is pushed to and fro by
-a few counts, so that a light hand is told from a heavy one before the wall acts.
+a few counts, so that a light hand is told from a heavy one before the wall acts. The torque begins
+with what moves the lightest hand by as much, and grows with the mass that is found.
 """
 
 import math
@@ -61,7 +62,8 @@ REGRESSION = np.dtype(
         ("samples", "f8", (_RECENT,)),  # the last ones, newest first [rad]
         ("way", "f8"),  # to the last sample [rad]
         ("steady", "i8"),  # samples since the handle stuck, or turned on an elastic shaft
-        ("probe", "f8"),  # torque before a contact [N·m]
+        ("probe", "f8"),  # torque before a contact for the lightest hand [N·m]
+        ("stronger", "f8"),  # that of the present probe, as a multiple of it
         ("probe_samples", "i8"),  # half its period
         ("probed", "i8"),  # samples of the present probe
         ("probing", "?"),  # the force of this cycle is a probe's
@@ -107,8 +109,9 @@ _FRICTION = 0.02
 #: Time before a contact from which on the handle is probed [s], and half the period of the probe
 #: [samples]: as slow as the observer lets through.
 _PROBE_S, _PROBE_SAMPLES = 0.06, 4
-#: Motion of the lightest hand under the probe, from end to end [counts].
-_PROBE_COUNTS = 4.0
+#: Motion of a hand under the probe, from end to end [counts], and the strongest torque of a probe
+#: for any but the lightest one [N·m].
+_PROBE_COUNTS, _STRONGEST_PROBE = 4.0, 0.04
 
 
 def set_regression(
@@ -464,21 +467,26 @@ def predict_regression(regression: Record, in_flight: NDArray[np.float64], force
 
 
 @compiled
-def probe(regression: Record, wall: Record) -> float:
+def probe(regression: Record, wall: Record, mass: float) -> float:
     """Return a torque to and fro if the handle is about to come into contact, else zero.
 
-    To be called while the wall gives no force.
+    To be called while the wall gives no force. mass: the one in force.
     """
     comes = -regression.way >= _LEAST_WAY * regression.resolution
     if not (comes and 0.0 < wall.y <= -wall.v * _PROBE_S):
         regression.probed = 0
         return 0.0
-    # The first half is half as long: the handle is pushed about its own path.
+    # The first half is half as long: the handle is pushed about its own path. It stays about it if
+    # the torque changes where the probe adds nothing to its velocity, half-way.
     half = regression.probe_samples
     swing = (regression.probed + half // 2) // half
+    if regression.probed % half == 0:
+        heavier = mass / (regression.lightest + regression.rotor)
+        regression.stronger = max(min(heavier, _STRONGEST_PROBE / regression.probe), 1.0)
     regression.probed += 1
     regression.probing = True
-    return regression.probe if swing % 2 == 0 else -regression.probe
+    torque = regression.stronger * regression.probe
+    return torque if swing % 2 == 0 else -torque
 
 
 @compiled

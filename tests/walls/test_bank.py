@@ -141,6 +141,21 @@ def test_filters_are_quicker_on_softer_walls() -> None:
         np.testing.assert_allclose(bank["gain"][0, :, i], alone["steady_gain"][0], rtol=0.1)
 
 
+def test_filters_are_quickest_behind_a_handle_that_moves() -> None:
+    """On the stiffest wall as well, until it has moved by less than 1.5 counts for 0.1 s."""
+    bank, _ = bank_at(0.0)
+    set_pace(bank[0], 1e9)
+    steadiest = bank["gain"][0].copy()
+    bank["regression"]["way"] = -1.6 * COUNT
+    set_pace(bank[0], 1e9)
+    quickest = bank["gain"][0].copy()
+    assert np.all(quickest[:, 6:16] > 1.05 * steadiest[:, 6:16])
+    bank["regression"]["way"] = COUNT
+    for j in range(101):
+        np.testing.assert_array_equal(bank["gain"][0], quickest if j < 100 else steadiest)
+        set_pace(bank[0], 1e9)
+
+
 def test_torques_act_at_the_delay_that_is_found() -> None:
     bank, estimator = bank_at(0.0)
     correct_bank(bank[0], estimator[0], 0.0)

@@ -195,7 +195,7 @@ def test_probe_is_shortly_before_a_contact_only() -> None:
     def probed(y: float, v: float) -> float:
         wall["y"], wall["v"] = y, v
         regression["way"] = PERIOD * v
-        return float(probe(regression[0], wall[0]))
+        return float(probe(regression[0], wall[0], LIGHTEST))
 
     assert probed(0.05, -0.5) == 0.0  # 100 ms away
     assert probed(0.01, 0.5) == 0.0  # on its way out
@@ -209,3 +209,22 @@ def test_probe_is_shortly_before_a_contact_only() -> None:
     y = np.cumsum(v) * PERIOD
     drift = np.polynomial.Polynomial.fit(np.arange(32), y, 1)(np.arange(32))
     assert np.ptp(y - drift) == pytest.approx(4.0 * COUNT, rel=0.35)
+
+
+@pytest.mark.parametrize(("heavier", "stronger"), [(0.5, 1.0), (3.0, 3.0), (36.0, 0.04 / 0.0048)])
+def test_probe_is_as_strong_as_the_mass_that_is_found_wants(
+    heavier: float, stronger: float
+) -> None:
+    """It moves nobody by more, and pushes with 0.04 N·m at the most; it stays about the path."""
+    regression, wall = made(), np.zeros(1, WALL)
+    wall["y"], wall["v"] = 0.01, -0.5
+    regression["way"] = -0.5 * PERIOD
+    torques = np.empty(40)
+    for j in range(len(torques)):
+        found = LIGHTEST if j < 6 else heavier * LIGHTEST
+        torques[j] = probe(regression[0], wall[0], found)
+    np.testing.assert_allclose(np.abs(torques[:8]), 0.0048)
+    np.testing.assert_allclose(np.abs(torques[8:]), stronger * 0.0048)
+    v = np.cumsum(torques) * PERIOD
+    assert np.ptp(v[8:]) == pytest.approx(4.0 * PERIOD * stronger * 0.0048)
+    assert np.max(v[8:]) == pytest.approx(-np.min(v[8:]))
