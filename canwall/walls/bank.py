@@ -119,7 +119,7 @@ _STEADIEST, _QUICKENING = 0.5, 1.0 / 4.5
 #: Least way of a handle that moves [counts a sample], and the time after it for which all filters
 #: are as quick as the lightest [s]: noise is felt at rest alone, and a filter that is slow to find
 #: the push after a blow makes a heavy hand bounce.
-_MOVES, _LIVELY_S = 1.5, 0.1
+_MOVES, _LIVELY_S = 6.0, 0.2
 #: Share of half a count within which a reading does not contradict the prediction of a heavy hand,
 #: whose motion between two samples is known better than that. A light one needs each correction.
 _WITHIN = 0.8
