@@ -449,6 +449,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     row.stiffness_in_force = cycle.share * cycle.guard[0].factor * wall.stiffness
     row.mass_est = estimator.mass
     row.mass_spread = cycle.bank[0].spread
+    row.delay_est = estimator.told + cycle.bank[0].regression[0].excess
     row.wall_position_rad = rendered.position
     row.guard = cycle.guard[0].factor
     cycle.j += 1

@@ -79,6 +79,7 @@ COLUMNS = (
     Column("stiffness_in_force", "f8", "N·m/rad", "stiffness that is rendered: as far as the cap"),
     Column("mass_est", "f8", "kg·m²", "mass in force in the model: drive, handle and hand"),
     Column("mass_spread", "f8", "", "its standard deviation, relative; 0: nothing learned"),
+    Column("delay_est", "f8", "cycles", "delay from a sample to its torque: as told, and as found"),
     Column("wall_position_rad", "f8", "rad", "position of the wall on the drive's axis"),
     Column("guard", "f8", "", "factor of the guard on the force of the law; 1: untouched"),
     Column("sync_interval_s", "f8", "s", "time since the SYNC before, measured", by_clock=True),

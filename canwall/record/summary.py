@@ -46,7 +46,7 @@ def summarise(
     rendering = numbers(signals, "phase") == Phase.RENDERING
     work = metrics.energy_out(y, force)
     touched = metrics.contacts(np.where(rendering, y, np.inf), force)
-    names = ("stiffness_in_force", "mass_est", "mass_spread")
+    names = ("stiffness_in_force", "mass_est", "mass_spread", "delay_est")
     in_force = {name: numbers(signals, name) for name in names}
     strikes = [
         _strike(strike, y, force, work, stiffness, laws, settings, units, referent, referent_felt)
@@ -163,6 +163,7 @@ def _in_force(
         ),
         "mass_est_kg_m2": float(in_force["mass_est"][last]),
         "mass_spread": float(in_force["mass_spread"][last]),
+        "delay_est_cycles": float(in_force["delay_est"][last]),
     }
 
 

@@ -103,6 +103,11 @@ def test_summary_has_what_is_in_force(unknown: tuple[pa.Table, dict[str, Any]]) 
     assert mass == pytest.approx(4.2e-4, rel=0.35)
     assert 0.0 < judgement["mass_spread"] < 0.5
     assert judgement["stiffness_in_force"] == pytest.approx(0.5 * mass / 1e-6, rel=0.05)
+    # A SYNC, the drive's cycle and its current loop, as told; then as found.
+    delay = table["delay_est"].to_numpy()
+    assert delay[0] == pytest.approx(1.0 + (0.25e-3 + 1.0 / (2.0 * np.pi * 1600.0)) / 1e-3)
+    assert judgement["delay_est_cycles"] == pytest.approx(delay[0], abs=0.15)
+    assert judgement["delay_est_cycles"] != delay[0]
     assert judgement["stiffness_in_force_least"] <= judgement["stiffness_in_force"]
 
 
