@@ -40,7 +40,7 @@ from canwall.walls.shaft import ElasticShaft
 #: Largest number of filters.
 MAX_FILTERS = 24
 
-#: Stiffnesses for which filters have gains.
+#: Stiffnesses for which filters have gains, and after these, of a handle that moves.
 _PACES = 8
 
 #: A bank, in the order of the masses. Gains, covariances and transitions are made beforehand:
@@ -58,8 +58,9 @@ BANK = np.dtype(
         ("state", "f8", (3, MAX_FILTERS)),
         ("gain", "f8", (3, MAX_FILTERS)),
         # Gains, `with_velocity` and `equal_samples` for softer and softer walls, each half as stiff
-        # as the one before; stiffness of the first, and number of the one in force.
-        ("paces", "f8", (_PACES, 6, MAX_FILTERS)),
+        # as the one before, and for a handle that moves; stiffness of the first, and number of the
+        # one in force.
+        ("paces", "f8", (_PACES + 1, 6, MAX_FILTERS)),
         ("steadiest", "f8"),
         ("pace", "i8"),
         # Samples for which a handle that moved is followed quickly, and those that are left.
@@ -115,7 +116,7 @@ _AS_QUICK, _STEADINESS = 3.0, 0.52
 #: K·T²/m from which on a filter is at its steadiest, and the power of the stiffness with which its
 #: bandwidth rises below, up to the lightest one's: on a soft wall noise is felt less, and a filter
 #: that is slower than the wall makes a heavy hand bounce.
-_STEADIEST, _QUICKENING = 0.5, 1.0 / 4.5
+_STEADIEST, _QUICKENING = 0.5, 1.0 / 6.0
 #: Least way of a handle that moves [counts a sample], and the time after it for which all filters
 #: are as quick as the lightest [s]: noise is felt at rest alone, and a filter that is slow to find
 #: the push after a blow makes a heavy hand bounce.
@@ -207,9 +208,9 @@ def _set_paces(
     steadiest = bank["steadiest"] * math.exp(bank["log_step"] * (i + 1 - bank["count"]))
     steady = np.concatenate([model.gain, _rest(model, period)])
     quick = np.concatenate([quickest.gain, _rest(quickest, period)])
-    for k in range(_PACES):
+    for k in range(_PACES + 1):
         softer = max(steadiest / bank["steadiest"] * 2.0**k, 1.0)
-        quicker = min(softer**_QUICKENING, 1.0 / slower)
+        quicker = 1.0 / slower if k == _PACES else min(softer**_QUICKENING, 1.0 / slower)
         share = math.log(quicker) / -math.log(slower) if slower < 1.0 else 0.0
         bank["paces"][k, :, i] = steady * (quick / steady) ** share
 
@@ -304,7 +305,7 @@ def set_pace(bank: Record, stiffness: float) -> None:
         bank.lively_left = bank.lively
     elif bank.lively_left > 0:
         bank.lively_left -= 1
-    pace = _PACES - 1
+    pace = _PACES if bank.lively_left > 0 else _PACES - 1
     if stiffness > 0.0 and bank.lively_left == 0:
         pace = min(max(int(math.log2(bank.steadiest / stiffness)), 0), pace)
     if pace == bank.pace:

@@ -127,14 +127,14 @@ def test_state_is_that_of_the_matching_filter_alone(i: int) -> None:
 
 
 def test_filters_are_quicker_on_softer_walls() -> None:
-    """By K^(-1/4.5) below K·T²/m = 0.5, up to the lightest one's; gains as by their own Riccati."""
+    """By K^(-1/6) below K·T²/m = 0.5, up to the lightest one's; gains as by their own Riccati."""
     bank, _ = bank_at(0.0)
     stiffest = 0.5 * MASSES[15] / PERIOD**2
     for softer, i in ((1.0, 15), (4.0, 15), (64.0, 15), (16.0, 9), (64.0, 2)):
         set_pace(bank[0], 0.99 * stiffest / softer)
         of_its_own = softer * MASSES[i] / MASSES[15]
         slower = max(1.0, MASSES[i] / MASSES[0] / 3.0) ** -0.52
-        quicker = min(max(of_its_own, 1.0) ** (1.0 / 4.5), 1.0 / slower)
+        quicker = min(max(of_its_own, 1.0) ** (1.0 / 6.0), 1.0 / slower)
         walk = walk_of(i) * quicker**3
         alone = np.zeros(1, ESTIMATOR)
         set_estimator(alone, MASSES[i], VISCOUS[i], 0.0, 0.0, PERIOD, COUNT, walk, DELAY)
