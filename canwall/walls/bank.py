@@ -305,8 +305,10 @@ def set_pace(bank: Record, stiffness: float) -> None:
         bank.lively_left = bank.lively
     elif bank.lively_left > 0:
         bank.lively_left -= 1
-    pace = _PACES if bank.lively_left > 0 else _PACES - 1
-    if stiffness > 0.0 and bank.lively_left == 0:
+    pace = _PACES - 1
+    if bank.lively_left > 0:
+        pace = _PACES
+    elif stiffness > 0.0:
         pace = min(max(int(math.log2(bank.steadiest / stiffness)), 0), pace)
     if pace == bank.pace:
         return
