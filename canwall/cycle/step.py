@@ -28,6 +28,7 @@ from canwall.walls import (
     predict,
     predict_bank,
     predict_open_loop,
+    probe_acts,
     put_in_force,
     set_applied_force,
     set_model,
@@ -316,7 +317,9 @@ def _may_begin_to_lag(cycle: Record) -> bool:
 def _compare_lag(cycle: Record) -> None:
     """Compare the sample with both predictions, and go on with the likelier one in the end."""
     lagging, losing = cycle.lagging[0], cycle.losing[0]
-    cycle.lag_evidence += likelier(lagging, losing, cycle.oriented)
+    if not probe_acts(cycle.bank[0].regression[0]):
+        # What a probe moves tells who is at the handle, whom neither model knows yet.
+        cycle.lag_evidence += likelier(lagging, losing, cycle.oriented)
     if cycle.lag_evidence > _LAG_EVIDENCE:
         cycle.estimator[0] = lagging
         cycle.lag += 1

@@ -53,6 +53,7 @@ from canwall.walls.interface import (
 from canwall.walls.latch import LATCH, at_sync, reset_latch, set_latch
 from canwall.walls.layers import TENSION, set_applied_force, wall_force
 from canwall.walls.registry import LAWS, declare_law, find_law, is_declared
+from canwall.walls.regression import probe_acts
 from canwall.walls.shaft import ElasticShaft, WallLoop, stiffest_wall
 
 __all__ = [
@@ -91,6 +92,7 @@ __all__ = [
     "predict",
     "predict_bank",
     "predict_open_loop",
+    "probe_acts",
     "put_in_force",
     "reset_bank",
     "reset_estimator",

@@ -274,7 +274,7 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
         for i in range(n):
             state[0, i], state[1, i], state[2, i] = estimator.y, estimator.v, estimator.d
         bank.equal = 0
-        begin_regression(bank.regression[0], y_sample)
+        begin_regression(bank.regression[0], y_sample, estimator.in_flight[estimator.delay_periods])
         return False
     for i in range(n):
         residual = y_sample - state[0, i]

@@ -172,11 +172,16 @@ def reset_regression(regression: np.void, y: float) -> None:
 
 
 @compiled
-def begin_regression(regression: Record, y: float) -> None:
-    """Begin at rest at y; what is known of the mass stays."""
+def begin_regression(regression: Record, y: float, torque: float) -> None:
+    """Begin at rest at y, where something holds against a torque; what is known stays.
+
+    A torque that seemed to begin now and to move nothing would be on something heavy.
+    """
+    t = regression.period
     regression.observed[:] = 0.0
-    regression.observed[0, 0] = regression.load = y
-    regression.shaft_torque = 0.0
+    regression.observed[2, 1] = -torque
+    regression.shaft_torque, regression.begun = torque, 0.5 * t * t * torque
+    regression.observed[0, 0] = regression.load = y - regression.softness * t * t * torque
     regression.samples[:] = y
     regression.way = 0.0
     regression.steady = regression.probed = 0
@@ -487,6 +492,15 @@ def probe(regression: Record, wall: Record, mass: float) -> float:
     regression.probing = True
     torque = regression.stronger * regression.probe
     return torque if swing % 2 == 0 else -torque
+
+
+@compiled
+def probe_acts(regression: Record) -> bool:
+    """Return True if one of the torques in flight is a probe's."""
+    acts = False
+    for torque in regression.probes:
+        acts |= torque != 0.0
+    return acts
 
 
 @compiled
