@@ -41,8 +41,11 @@ from canwall.run import stop_on_signals
 EMCY = 0x085
 ENABLE_OPERATION = 0x0F
 
-#: A hand that stays on the wall.
+#: A hand that stays on a wall so much softer than itself that lost samples do not make it swing.
 CHANGES = ON_A_BUSY_MACHINE | {
+    "stiffness_nm_per_rad = 50.0": "stiffness_nm_per_rad = 0.5",
+    'law = "mean_force"': 'law = "standard"',
+    "cap = 0.8\n": "",
     "press_s = 0.5": "press_s = 3000.0",
     "strikes = 4\n": "strikes = 1\n",
     "interval_s = 1.0": "interval_s = 4000.0",

@@ -37,10 +37,11 @@ SLOW = {
     "cycle_s = 0.001": 'cycle_s = 0.05\npace = "real_time"',
     "wait_s = 5.0": "wait_s = 60.0\nwatchdog_s = 5.0",
     "stiffness_nm_per_rad = 50.0": "stiffness_nm_per_rad = 0.5",
-    "hold_cycles = 2": "hold_cycles = 100",
+    "hold_cycles = 2": "hold_cycles = 0",
     "ramp_cycles = 10": "ramp_cycles = 1000\nstuck_rad = 0.0\nlate_cycles = 0",
     'law = "mean_force"': 'law = "standard"',
     "cap = 0.8\n": "",
+    "speed_rad_s = 60.0": "speed_rad_s = 600.0",
 }
 
 #: A hand that leans on the wall, until the run ends by itself.
