@@ -34,8 +34,8 @@ PATIENCE_S = 400.0
 #: Changes of config/vcan.toml: SYNCs of a rate that an emulated processor keeps beside whatever
 #: else its machine does, and a wall that bears it.
 SLOW = {
-    "cycle_s = 0.001": 'cycle_s = 0.05\npace = "real_time"',
-    "wait_s = 5.0": "wait_s = 60.0\nwatchdog_s = 5.0",
+    "cycle_s = 0.001": 'cycle_s = 0.1\npace = "real_time"',
+    "wait_s = 5.0": "wait_s = 60.0\nwatchdog_s = 5.0\nsdo_timeout_s = 2.0",
     "stiffness_nm_per_rad = 50.0": "stiffness_nm_per_rad = 0.5",
     "hold_cycles = 2": "hold_cycles = 0",
     "ramp_cycles = 10": "ramp_cycles = 1000\nstuck_rad = 0.0\nlate_cycles = 0",
