@@ -294,22 +294,29 @@ def _write_cap(dataset: xr.Dataset) -> Iterator[str]:
                 ]
                 name = f"{description} K in force ÷ min(K, m/T²)"
                 yield _row(name, [_number(value) for value in values])
+            for name, cells in _first_strike(dataset.sel(some)):
+                yield _row(f"first strike: {name}", cells)
 
 
 def _write_first_strikes(dataset: xr.Dataset) -> Iterator[str]:
-    """Yield depth over the referent's, and the fastest exit over the speed of approach."""
-    operators = _names(dataset, "operator")
-    ratio = dataset["first_depth"] / dataset["referent_first_depth"]
-    yield from _head(operators)
+    """Yield depth and exit of the first strikes of each law."""
+    yield from _head(_names(dataset, "operator"))
     for law in _names(dataset, "law"):
-        for name, values, quantile in (
-            ("deepest, 95 % of strikes", ratio, 0.95),
-            ("deepest", ratio, 1.0),
-            ("fastest exit", dataset["restitution"], 1.0),
-        ):
-            of_law = values.sel(law=law)
-            cells = [_quantile(of_law.sel(operator=o), quantile) for o in operators]
+        for name, cells in _first_strike(dataset.sel(law=law)):
             yield _row(f"{law}: {name}", cells)
+
+
+def _first_strike(of_law: xr.Dataset) -> Iterator[tuple[str, list[str]]]:
+    """Yield depth over the referent's, and the fastest exit over the speed of approach."""
+    depth = of_law["first_depth"] / of_law["referent_first_depth"]
+    for name, values, quantile in (
+        ("deepest, 95 % of strikes", depth, 0.95),
+        ("deepest", depth, 1.0),
+        ("fastest exit", of_law["restitution"], 1.0),
+    ):
+        yield name, [
+            _quantile(values.sel(operator=o), quantile) for o in _names(of_law, "operator")
+        ]
 
 
 def _quantile(values: xr.DataArray, quantile: float) -> str:

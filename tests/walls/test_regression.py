@@ -12,6 +12,7 @@ from canwall.physics import advance, make_plant
 from canwall.walls import ESTIMATOR, WALL
 from canwall.walls.regression import (
     REGRESSION,
+    begin_regression,
     forget_mass,
     learn,
     mean_above_zero,
@@ -21,14 +22,15 @@ from canwall.walls.regression import (
     set_regression,
     solve,
 )
+from canwall.walls.shaft import ElasticShaft
 
 PERIOD, COUNT, LIGHTEST = 1e-3, 4.8e-5, 1e-4
 Array = NDArray[np.float64]
 
 
-def made() -> NDArray[np.void]:
+def made(shaft: ElasticShaft | None = None) -> NDArray[np.void]:
     regression = np.zeros(1, REGRESSION)
-    set_regression(regression[0], LIGHTEST, PERIOD, COUNT, 0.0)
+    set_regression(regression[0], LIGHTEST, PERIOD, COUNT, 0.0, shaft)
     reset_regression(regression[0], 0.0)
     return regression
 
@@ -187,6 +189,24 @@ def test_swing_against_friction_tells_the_mass(mass: float) -> None:
         y, v, _ = advance(plant[0], y, v, torque, 0.0, PERIOD)
     assert known == pytest.approx(mass, rel=0.1)
     assert deviation < 0.15 * found
+
+
+@pytest.mark.parametrize("shaft", [None, ElasticShaft(LIGHTEST, 0.4 * LIGHTEST, 250.0, 0.02)])
+def test_torque_that_something_holds_tells_nothing(shaft: ElasticShaft | None) -> None:
+    """After lost samples the handle rests under a torque that seems to move nothing."""
+    torque, estimator = 0.3, np.zeros(1, ESTIMATOR)
+    found = []
+    for known_from_the_beginning in (True, False):
+        regression = made(shaft)
+        estimator["in_flight"] = torque
+        begin_regression(regression[0], 0.0, torque if known_from_the_beginning else 0.0)
+        for _ in range(60):
+            learn(regression[0], estimator[0], 0.0, LIGHTEST)
+            send(regression, estimator, torque)
+        found.append(mass_known(regression, LIGHTEST))
+    lightest = LIGHTEST - (shaft.rotor if shaft else 0.0)
+    assert found[0] == pytest.approx(lightest, rel=0.2)
+    assert found[1] > 5.0 * lightest
 
 
 def test_probe_is_shortly_before_a_contact_only() -> None:
