@@ -24,8 +24,8 @@ from canwall.record import read_signals
 PATIENCE_S = 60.0
 
 #: Changes of config/unixcan.toml for a run in real time that does not end because the machine has
-#: other things to do: frames may be missing or late for long, and the torque only falls meanwhile; a
-#: law that went on at predicted positions would swing by itself.
+#: other things to do: frames may be missing or late for long, and the torque only falls meanwhile.
+#: (A law that goes on at predicted positions for so long swings by itself.)
 ON_A_BUSY_MACHINE = {
     "cycle_s = 0.001": 'cycle_s = 0.004\npace = "real_time"',
     "wait_s = 5.0": "wait_s = 20.0\nwatchdog_s = 0.5",

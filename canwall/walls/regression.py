@@ -112,8 +112,8 @@ _PROBE_S, _PROBE_SAMPLES = 0.06, 4
 #: Motion of a hand under the probe, from end to end [counts], and the strongest torque of a probe
 #: for any but the lightest one [N·m].
 _PROBE_COUNTS, _STRONGEST_PROBE = 4.0, 0.04
-#: Way of a sample [counts] from which on a probe of a hand that is not known grows with it: it moves
-#: the lightest handle by a third of its way.
+#: Way of a sample [counts] from which on the probe of a hand that is not known grows with it: the
+#: lightest handle moves by a third of its way.
 _PROBE_WAY = 3.0
 
 
