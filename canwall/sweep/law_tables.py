@@ -308,15 +308,14 @@ def _write_first_strikes(dataset: xr.Dataset) -> Iterator[str]:
 
 def _first_strike(of_law: xr.Dataset) -> Iterator[tuple[str, list[str]]]:
     """Yield depth over the referent's, and the fastest exit over the speed of approach."""
+    operators = _names(of_law, "operator")
     depth = of_law["first_depth"] / of_law["referent_first_depth"]
     for name, values, quantile in (
         ("deepest, 95 % of strikes", depth, 0.95),
         ("deepest", depth, 1.0),
         ("fastest exit", of_law["restitution"], 1.0),
     ):
-        yield name, [
-            _quantile(values.sel(operator=o), quantile) for o in _names(of_law, "operator")
-        ]
+        yield name, [_quantile(values.sel(operator=o), quantile) for o in operators]
 
 
 def _quantile(values: xr.DataArray, quantile: float) -> str:
