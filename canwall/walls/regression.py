@@ -112,9 +112,6 @@ _PROBE_S, _PROBE_SAMPLES = 0.06, 4
 #: Motion of a hand under the probe, from end to end [counts], and the strongest torque of a probe
 #: for any but the lightest one [N·m].
 _PROBE_COUNTS, _STRONGEST_PROBE = 4.0, 0.04
-#: Way of a sample [counts] from which on the probe of a hand that is not known grows with it: the
-#: lightest handle moves by a third of its way.
-_PROBE_WAY = 3.0
 
 
 def set_regression(
@@ -475,11 +472,10 @@ def predict_regression(regression: Record, in_flight: NDArray[np.float64], force
 
 
 @compiled
-def probe(regression: Record, wall: Record, mass: float, known: bool) -> float:
+def probe(regression: Record, wall: Record, mass: float) -> float:
     """Return a torque to and fro if the handle is about to come into contact, else zero.
 
-    To be called while the wall gives no force. mass: the one in force. known: True if it was found
-    with little doubt; of a stranger that comes fast there is little time to learn.
+    To be called while the wall gives no force. mass: the one in force.
     """
     comes = -regression.way >= _LEAST_WAY * regression.resolution
     if not (comes and 0.0 < wall.y <= -wall.v * _PROBE_S):
@@ -491,9 +487,7 @@ def probe(regression: Record, wall: Record, mass: float, known: bool) -> float:
     swing = (regression.probed + half // 2) // half
     if regression.probed % half == 0:
         heavier = mass / (regression.lightest + regression.rotor)
-        faster = 0.0 if known else -regression.way / (_PROBE_WAY * regression.resolution)
-        most = _STRONGEST_PROBE / regression.probe
-        regression.stronger = max(min(max(heavier, faster), most), 1.0)
+        regression.stronger = max(min(heavier, _STRONGEST_PROBE / regression.probe), 1.0)
     regression.probed += 1
     regression.probing = True
     torque = regression.stronger * regression.probe
