@@ -288,12 +288,9 @@ def _write_cap(dataset: xr.Dataset) -> Iterator[str]:
                 each = [of_kind.sel(operator=operator) for operator in operators]
                 yield _row(name, [f"{int(these.sum())} of {these.size}" for these in each])
             for description, quantile in (("least", 0.0), ("median", 0.5)):
-                values = [
-                    float(np.nanquantile(share.sel(some).sel(operator=o), quantile))
-                    for o in operators
-                ]
+                each = [share.sel(some).sel(operator=o) for o in operators]
                 name = f"{description} K in force ÷ min(K, m/T²)"
-                yield _row(name, [_number(value) for value in values])
+                yield _row(name, [_quantile(these, quantile) for these in each])
             for name, cells in _first_strike(dataset.sel(some)):
                 yield _row(f"first strike: {name}", cells)
 
