@@ -20,6 +20,7 @@ from commands import (
     COMMAND,
     ON_A_BUSY_MACHINE,
     PATIENCE_S,
+    SOFT_WALL,
     STOPPED_SAID,
     Record,
     Start,
@@ -41,16 +42,17 @@ from canwall.run import stop_on_signals
 EMCY = 0x085
 ENABLE_OPERATION = 0x0F
 
-#: A hand that stays on a wall so much softer than itself that lost samples do not make it swing.
-CHANGES = ON_A_BUSY_MACHINE | {
-    "stiffness_nm_per_rad = 50.0": "stiffness_nm_per_rad = 0.5",
-    'law = "mean_force"': 'law = "standard"',
-    "cap = 0.8\n": "",
-    "press_s = 0.5": "press_s = 3000.0",
-    "strikes = 4\n": "strikes = 1\n",
-    "interval_s = 1.0": "interval_s = 4000.0",
-    "duration_s = 4.2\n": "",
-}
+#: A hand that stays on the wall.
+CHANGES = (
+    ON_A_BUSY_MACHINE
+    | SOFT_WALL
+    | {
+        "press_s = 0.5": "press_s = 3000.0",
+        "strikes = 4\n": "strikes = 1\n",
+        "interval_s = 1.0": "interval_s = 4000.0",
+        "duration_s = 4.2\n": "",
+    }
+)
 
 #: Objects without which each watchdog is the strongest one left, and the code of its EMCY.
 WATCHDOGS = {

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import can
 import pytest
-from commands import GUARD_SAID, config_file, torque_is_on
+from commands import GUARD_SAID, ON_A_BUSY_MACHINE, SOFT_WALL, config_file, torque_is_on
 from other_nodes import OtherNodes
 
 import canwall.cycle.way_out
@@ -33,16 +33,15 @@ PATIENCE_S = 400.0
 
 #: Changes of config/vcan.toml: SYNCs of a rate that an emulated processor keeps beside whatever
 #: else its machine does, and a wall that bears it.
-SLOW = {
-    "cycle_s = 0.001": 'cycle_s = 0.1\npace = "real_time"',
-    "wait_s = 5.0": "wait_s = 60.0\nwatchdog_s = 5.0\nsdo_timeout_s = 2.0",
-    "stiffness_nm_per_rad = 50.0": "stiffness_nm_per_rad = 0.5",
-    "hold_cycles = 2": "hold_cycles = 0",
-    "ramp_cycles = 10": "ramp_cycles = 1000\nstuck_rad = 0.0\nlate_cycles = 0",
-    'law = "mean_force"': 'law = "standard"',
-    "cap = 0.8\n": "",
-    "speed_rad_s = 60.0": "speed_rad_s = 600.0",
-}
+SLOW = (
+    ON_A_BUSY_MACHINE
+    | SOFT_WALL
+    | {
+        "cycle_s = 0.001": 'cycle_s = 0.1\npace = "real_time"',
+        "wait_s = 5.0": "wait_s = 60.0\nwatchdog_s = 5.0\nsdo_timeout_s = 2.0",
+        "ramp_cycles = 10": "ramp_cycles = 1000\nstuck_rad = 0.0\nlate_cycles = 0",
+    }
+)
 
 #: A hand that leans on the wall, until the run ends by itself.
 UNTIL_STOPPED = {"rest_rad = 0.1": "rest_rad = -0.1", "duration_s = 4.2": ""}
