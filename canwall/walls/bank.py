@@ -121,6 +121,8 @@ _STEADIEST, _QUICKENING = 0.5, 1.0 / 6.0
 #: are as quick as the lightest [s]: noise is felt at rest alone, and a filter that is slow to find
 #: the push after a blow makes a heavy hand bounce.
 _MOVES, _LIVELY_S = 6.0, 0.2
+#: Deviation of the mass below which the handle is probed no harder for coming fast.
+_KNOWN_SPREAD = 0.2
 #: Share of half a count within which a reading does not contradict the prediction of a heavy hand,
 #: whose motion between two samples is known better than that. A light one needs each correction.
 _WITHIN = 0.8
@@ -463,6 +465,7 @@ def predict_bank(bank: Record, estimator: Record, force: float) -> None:
 def with_probe(bank: Record, wall: Record, force: float) -> float:
     """Return the force of a law, and where that is zero the torque of a probe, unless it holds."""
     if force == 0.0 and not bank.holds:
-        return probe(bank.regression[0], wall, bank.mass)
+        known = 0.0 < bank.spread < _KNOWN_SPREAD
+        return probe(bank.regression[0], wall, bank.mass, known)
     bank.regression[0].probed = 0
     return force

@@ -4,16 +4,18 @@ One fast observer, with a bias of its own, follows the positions without any tor
 alone, the velocity alone, its direction alone, and the difference that a later torque makes. What
 it does not expect of the positions is −1/m times the same of the torque, −δ/m times that of the
 difference, plus b/m times that of the velocity, plus f_c/m times that of the direction (Coulomb
-friction), plus something steady from a hand whose force changes steadily. What changes more slowly
-(the operator's push, friction in one direction) is in none of them. δ is the delay beyond the one
-told. It is the drive's: what was learned of it is kept when the hand goes.
+friction), plus something steady, of a hand whose force changes, which changes slowly from sample to
+sample. What changes more slowly (the operator's push, friction in one direction) is in none of
+them. δ is the delay beyond the one told. It is the drive's: what was learned of it is kept when the
+hand goes.
 
 On an elastic shaft it is the load that is observed, by what the rotor tells of it, and the delay is
 as told.
 
 The torque is the wall's, or a probe's: shortly before a contact the handle is pushed to and fro by
 a few counts, so that a light hand is told from a heavy one before the wall acts. The torque begins
-with what moves the lightest hand by as much, and grows with the mass that is found.
+with what moves the lightest hand by as much, and grows with the mass that is found, and with the
+speed of a hand that is not known.
 """
 
 import math
@@ -59,6 +61,7 @@ REGRESSION = np.dtype(
         ("normal", "f8", (6, 6)),  # the same with what is known before, as it is being solved
         ("noise", "f8"),  # mean square of what nothing explains [rad²]
         ("hand_torque", "f8"),  # surprise by a torque that changes as fast as a hand's
+        ("hand_change", "f8"),  # by how much that surprise changes until the next sample
         ("samples", "f8", (_RECENT,)),  # the last ones, newest first [rad]
         ("way", "f8"),  # to the last sample [rad]
         ("steady", "i8"),  # samples since the handle stuck, or turned on an elastic shaft
@@ -85,6 +88,8 @@ _STEADY, _LEAST_WAY = 6, 1.5
 #: Fastest change of a hand's force [N·m/s]. A torque that changes no faster may be its answer to
 #: the hand, and then says nothing of the mass: a wall that gives way to none looks heavy.
 _HAND_RATE = 8.0
+#: Random walk of that change [N·m/s per √s]: within 10 ms a hand begins to push, and ends.
+_HAND_RATE_WALK = 20.0
 #: Torque that says something whatever friction does, as a multiple of that of a hand.
 _STRONG = 4.0
 #: Uncertainty of a torque's course, as a share of its steps, as it usually is and at the most: a
@@ -112,6 +117,9 @@ _PROBE_S, _PROBE_SAMPLES = 0.06, 4
 #: Motion of a hand under the probe, from end to end [counts], and the strongest torque of a probe
 #: for any but the lightest one [N·m].
 _PROBE_COUNTS, _STRONGEST_PROBE = 4.0, 0.04
+#: Way of a sample [counts] from which on the probe of a hand that is not known grows with it: the
+#: lightest handle moves by a third of its way.
+_PROBE_WAY = 3.0
 
 
 def set_regression(
@@ -141,6 +149,8 @@ def set_regression(
     regression["gain"] = gain = _observer_gain(bandwidth, period)
     regression["surprise"][5] = abs(count)
     regression["hand_torque"] = _HAND_RATE * period / gain[2]
+    walk = 0.0 if shaft else _HAND_RATE_WALK
+    regression["hand_change"] = walk * math.sqrt(period) * period / gain[2]
     slower = round(_OBSERVER_HZ / bandwidth)
     regression["probe_samples"] = samples = slower * _PROBE_SAMPLES
     quarter = 0.5 * samples * period
@@ -212,6 +222,7 @@ def learn(regression: Record, estimator: Record, y_sample: float, mass: float) -
     steps = _torque_steps(estimator) * regression.period * regression.period
     explained = _is_explained(regression, steps)
     _note_way(regression, y_sample, explained)
+    _let_push_change(regression, mass)
     told = abs(_torque_surprise(regression)) / regression.hand_torque
     if told <= 1.0:
         _note_noise(regression, mass)
@@ -355,6 +366,21 @@ def _add_information(regression: Record, untimely: float, mass: float) -> None:
 
 
 @compiled
+def _let_push_change(regression: Record, mass: float) -> None:
+    """Let what is steady be another at the next sample, by a random walk.
+
+    A hand that begins to push while the wall does would look heavy. mass: the one in force.
+    """
+    information = regression.information
+    change = regression.hand_change / (mass * regression.resolution)
+    variance = change * change
+    for i in range(6):
+        share = information[i, 5] * variance / (1.0 + information[5, 5] * variance)
+        for c in range(6):
+            information[i, c] -= share * information[5, c]
+
+
+@compiled
 def _doubt(regression: Record) -> None:
     _forget(regression, _DOUBTED)
 
@@ -472,10 +498,11 @@ def predict_regression(regression: Record, in_flight: NDArray[np.float64], force
 
 
 @compiled
-def probe(regression: Record, wall: Record, mass: float) -> float:
+def probe(regression: Record, wall: Record, mass: float, known: bool) -> float:
     """Return a torque to and fro if the handle is about to come into contact, else zero.
 
-    To be called while the wall gives no force. mass: the one in force.
+    To be called while the wall gives no force. mass: the one in force. known: True if it was found
+    with little doubt; of a stranger that comes fast there is little time to learn.
     """
     comes = -regression.way >= _LEAST_WAY * regression.resolution
     if not (comes and 0.0 < wall.y <= -wall.v * _PROBE_S):
@@ -487,7 +514,9 @@ def probe(regression: Record, wall: Record, mass: float) -> float:
     swing = (regression.probed + half // 2) // half
     if regression.probed % half == 0:
         heavier = mass / (regression.lightest + regression.rotor)
-        regression.stronger = max(min(heavier, _STRONGEST_PROBE / regression.probe), 1.0)
+        faster = 0.0 if known else -regression.way / (_PROBE_WAY * regression.resolution)
+        most = _STRONGEST_PROBE / regression.probe
+        regression.stronger = max(min(max(heavier, faster), most), 1.0)
     regression.probed += 1
     regression.probing = True
     torque = regression.stronger * regression.probe

@@ -79,7 +79,7 @@ def test_blow_tells_the_mass(mass: float) -> None:
     found, deviation = play(mass, torques, np.zeros(60))
     assert found == pytest.approx(1.0 / mass, rel=0.1)
     # Of the lightest a blow of 0.4 N·m leaves more open: its timing moves it by many counts.
-    assert deviation < (0.6 if mass == LIGHTEST else 0.3) * found
+    assert deviation < (0.65 if mass == LIGHTEST else 0.3) * found
 
 
 def test_torque_that_answers_a_hand_tells_nothing() -> None:
@@ -89,6 +89,15 @@ def test_torque_that_answers_a_hand_tells_nothing() -> None:
     # The mean of what there may be before the first torque.
     assert found == pytest.approx(mean_above_zero(1.0 / LIGHTEST, 0.7 / LIGHTEST))
     assert deviation > 0.5 * found
+
+
+def test_push_that_begins_with_the_wall_is_not_mass() -> None:
+    """Within 20 ms nobody's handle gets 0.15 N·m from the motor, and as much against it."""
+    j = np.arange(60)
+    torques = 0.15 * np.clip((j - 36) / 4.0, 0.0, 1.0)
+    push = -0.15 * np.clip((j - 26) / 24.0, 0.0, 1.0) ** 2
+    found, deviation = play(LIGHTEST, torques, push)
+    assert found == pytest.approx(1.0 / LIGHTEST, rel=0.15)
 
 
 def test_latch_of_the_position_is_noise() -> None:
@@ -203,7 +212,7 @@ def test_torque_that_something_holds_tells_nothing() -> None:
             send(regression, estimator, torque)
         found.append(mass_known(regression, LIGHTEST))
     assert found[0] == pytest.approx(LIGHTEST, rel=0.2)
-    assert found[1] > 5.0 * LIGHTEST
+    assert found[1] > 4.0 * LIGHTEST
 
 
 def test_probe_is_shortly_before_a_contact_only() -> None:
@@ -212,7 +221,7 @@ def test_probe_is_shortly_before_a_contact_only() -> None:
     def probed(y: float, v: float) -> float:
         wall["y"], wall["v"] = y, v
         regression["way"] = PERIOD * v
-        return float(probe(regression[0], wall[0], LIGHTEST))
+        return float(probe(regression[0], wall[0], LIGHTEST, True))
 
     assert probed(0.05, -0.5) == 0.0  # 100 ms away
     assert probed(0.01, 0.5) == 0.0  # on its way out
@@ -228,6 +237,21 @@ def test_probe_is_shortly_before_a_contact_only() -> None:
     assert np.ptp(y - drift) == pytest.approx(4.0 * COUNT, rel=0.35)
 
 
+def test_probe_of_a_stranger_grows_with_its_speed() -> None:
+    """It moves the lightest handle by a third of its way, with 0.04 N·m at the most."""
+    for counts, known, stronger in (
+        (2.0, False, 1.0),
+        (12.0, False, 4.0),
+        (12.0, True, 1.0),
+        (90.0, False, 0.04 / 0.0048),
+    ):
+        regression, wall = made(), np.zeros(1, WALL)
+        regression["way"] = -counts * COUNT
+        wall["y"], wall["v"] = 0.0005, -counts * COUNT / PERIOD
+        torques = [probe(regression[0], wall[0], LIGHTEST, known) for _ in range(8)]
+        np.testing.assert_allclose(np.abs(torques), stronger * 0.0048)
+
+
 @pytest.mark.parametrize(("heavier", "stronger"), [(0.5, 1.0), (3.0, 3.0), (36.0, 0.04 / 0.0048)])
 def test_probe_is_as_strong_as_the_mass_that_is_found_wants(
     heavier: float, stronger: float
@@ -239,7 +263,7 @@ def test_probe_is_as_strong_as_the_mass_that_is_found_wants(
     torques = np.empty(40)
     for j in range(len(torques)):
         found = LIGHTEST if j < 6 else heavier * LIGHTEST
-        torques[j] = probe(regression[0], wall[0], found)
+        torques[j] = probe(regression[0], wall[0], found, True)
     np.testing.assert_allclose(np.abs(torques[:8]), 0.0048)
     np.testing.assert_allclose(np.abs(torques[8:]), stronger * 0.0048)
     v = np.cumsum(torques) * PERIOD
