@@ -96,7 +96,7 @@ def test_push_that_begins_with_the_wall_is_not_mass() -> None:
     j = np.arange(60)
     torques = 0.15 * np.clip((j - 36) / 4.0, 0.0, 1.0)
     push = -0.15 * np.clip((j - 26) / 24.0, 0.0, 1.0) ** 2
-    found, deviation = play(LIGHTEST, torques, push)
+    found, _ = play(LIGHTEST, torques, push)
     assert found == pytest.approx(1.0 / LIGHTEST, rel=0.15)
 
 
