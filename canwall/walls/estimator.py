@@ -27,8 +27,6 @@ _SETTLED = 1e-6
 #: Variance of a quantised position [count²].
 _QUANTISATION = 1.0 / 12.0
 
-#: Square of the normalised innovation from which on a sample is as unlikely as any other.
-_IMPOSSIBLE = 25.0
 
 _HOLD = [("duration", "f8"), ("phi", "f8", (2, 2)), ("gamma", "f8", (2,))]
 
@@ -396,8 +394,13 @@ def _sample_variance(estimator: Record) -> float:
 
 @compiled
 def _misfit(estimator: Record, y_sample: float, variance: float) -> float:
+    """Return minus the logarithm of a sample's likelihood, but for a constant.
+
+    The distribution is Cauchy's: no model knows the hand so well that a sample is impossible, and
+    none that is far off decides alone.
+    """
     innovation = y_sample - estimator.y
-    return 0.5 * min(innovation * innovation / variance, _IMPOSSIBLE)
+    return math.log1p(innovation * innovation / variance)
 
 
 @compiled

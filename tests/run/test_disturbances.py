@@ -187,6 +187,16 @@ def test_an_adapting_model_tells_lost_from_late(begin: int) -> None:
     assert (late.trip, late.lag) == (Trip.NONE, 1)
 
 
+@pytest.mark.parametrize("begin", [247, 298, 332])
+def test_lost_tpdo_of_a_soft_wall_is_not_a_late_one(begin: int) -> None:
+    """Who is at the handle is learned meanwhile: both models are off, and one far off by chance."""
+    given: dict[str, Any] = {"operator.adapt": True, "mechanics.inertia_kg_m2": 1e-4}
+    settings, cycles = wall(1e-3, 10.0, **given)
+    lost = Disturbances.none(cycles)
+    lost.lost[begin] = True
+    assert simulate(settings, cycles, disturbances=lost).lag == 0
+
+
 def test_tpdo_that_is_late_once_does_not_disturb_the_estimate() -> None:
     settings, cycles = wall(1e-3, 50.0, **{"simulation.ideal": True})  # type: ignore[arg-type]
     begin = 262  # as the handle hits the wall
