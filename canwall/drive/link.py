@@ -186,13 +186,13 @@ class Link:
     def find_nodes(self, patience_s: float) -> list[int]:
         """Ask all nodes for their device type; return the node-IDs under which frames come.
 
-        A failure of the bus counts as silence. patience_s: time to listen [s].
+        A failure of the bus counts as silence. patience_s: time to listen after the questions [s].
         """
         scanner = self.network.scanner
         scanner.reset()
-        deadline = time.monotonic() + patience_s
         with contextlib.suppress(can.CanError):
             scanner.search()
+            deadline = time.monotonic() + patience_s
             while (remaining := deadline - time.monotonic()) > 0.0:
                 self.serve(remaining)
         return sorted(scanner.nodes)
