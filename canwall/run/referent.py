@@ -41,9 +41,10 @@ def referent_motion(
         wall_position: Position of the wall in each cycle [rad], shape (n,).
 
     Returns:
-        The motion; None without `[simulation]`, as a person's hand is not known.
+        The motion; None without `[simulation]`, as a person's hand is not known, and in measured
+        time for a drive in a process of its own, whose hand has begun before the run.
     """
-    if settings.simulation is None:
+    if settings.simulation is None or (settings.real_time and not settings.embedded):
         return None
     referent = Referent(settings, settings.simulation, len(wall_position))
     return referent.motion(asked, wall_position)

@@ -80,3 +80,16 @@ def test_damping_and_cap_are_those_of_the_mass_that_moves() -> None:
     exact = solve_ivp(motion, (0.0, t[-1]), (0.0, 0.0), t_eval=t, rtol=1e-9, max_step=1e-4).y[0]
     np.testing.assert_allclose(found.y, exact, atol=1e-6)
     assert found.y.min() < press / stiffness  # it overshoots: it is not overdamped
+
+
+def test_hand_of_a_drive_elsewhere_has_no_known_begin_in_measured_time() -> None:
+    wall, position = AskedWall(*[np.zeros(10)] * 4), np.zeros(10)
+    elsewhere = {"bus.interface": "unixcan", "bus.channel": "bus.sock"}
+    for changes, known in (
+        ({}, True),
+        ({"bus.pace": "real_time"}, True),
+        (elsewhere | {"bus.pace": "simulated"}, True),
+        (elsewhere | {"bus.pace": "real_time"}, False),
+    ):
+        referent = referent_motion(settings_with(changes), wall, position)
+        assert (referent is not None) == known, changes
