@@ -292,8 +292,7 @@ def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None
         delay,
         margin,
     )
-    probe = 1.5 * cycle["bank"][0, 0]["regression"]["probe"].item()
-    set_latch(cycle["latch"][0, 0], period, settings.drive.drive_cycle_s, count, probe)
+    set_latch(cycle["latch"][0, 0], period, settings.drive.drive_cycle_s, count)
     _bound_by_shaft(cycle)
     _reset(cycle, float(cycle["oriented"][0]))
 

@@ -17,11 +17,13 @@ from canwall.units import to_per_mille
 from canwall.walls import (
     acting_force,
     actuation_state,
+    age_at,
     at_sync,
     change_plant,
     correct,
     correct_bank,
     end_lag,
+    expect_torques,
     likelier,
     may_lag,
     note_missing_sample,
@@ -387,7 +389,8 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
         compare_position(cycle, cycle.counts - before, missed)
         if cycle.compares_lag:
             _compare_lag(cycle)
-        sample = at_sync(cycle.latch[0], estimator, cycle.j, cycle.oriented)
+        spread = cycle.bank[0].spread
+        sample = at_sync(cycle.latch[0], estimator, spread, cycle.j, cycle.oriented)
         correct(estimator, sample)
         if cycle.bank[0].adapts:
             _identify_operator(cycle, sample)
@@ -408,8 +411,10 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     sent = cycle.orientation * torque
     if cycle.frozen and cycle.frozen < cycle.stuck_cycles:
         predict_open_loop(estimator, sent)
+    excess = cycle.bank[0].regression[0].excess
+    expect_torques(cycle.latch[0], estimator, estimator.told + excess, cycle.j, sent)
     if cycle.bank[0].adapts:
-        predict_bank(cycle.bank[0], estimator, sent)
+        predict_bank(cycle.bank[0], estimator, sent, age_at(cycle.latch[0], cycle.j))
     predict(estimator, sent)
     if begins_lag:
         start_lagging(cycle.lagging[0], sent)

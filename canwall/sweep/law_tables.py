@@ -38,7 +38,7 @@ _FRICTION = 0.01
 _SPEEDS, _PHASES = (0.3, 0.8, 2.0), (0.0, 0.35, 0.7)
 _PRESS_S = 1.2
 #: With the cap: c, and the walls that are asked for [N·m/rad].
-CAPS = (0.5, 1.0)
+CAPS = (0.5, 0.8, 1.0)
 _ASKED = tuple(np.geomspace(30.0, 5000.0, 12).round(1).tolist())
 #: First strikes: the wall [N·m/rad], the speeds of approach [rad/s], and the phases.
 _FIRST_STIFFNESS = 200.0

@@ -50,7 +50,7 @@ from canwall.walls.interface import (
     set_plant,
     set_referent,
 )
-from canwall.walls.latch import LATCH, at_sync, reset_latch, set_latch
+from canwall.walls.latch import LATCH, age_at, at_sync, expect_torques, reset_latch, set_latch
 from canwall.walls.layers import TENSION, set_applied_force, wall_force
 from canwall.walls.registry import LAWS, declare_law, find_law, is_declared
 from canwall.walls.regression import probe_acts
@@ -73,6 +73,7 @@ __all__ = [
     "WallLoop",
     "acting_force",
     "actuation_state",
+    "age_at",
     "at_sync",
     "call_law",
     "change_plant",
@@ -81,6 +82,7 @@ __all__ = [
     "correct_bank",
     "declare_law",
     "end_lag",
+    "expect_torques",
     "find_law",
     "force_walk_of",
     "hand_damping",

@@ -86,6 +86,7 @@ BANK = np.dtype(
         ("told", "f8"),
         ("delay", "f8"),
         ("delay_in_force", "f8"),
+        ("age", "f8"),  # of the sample, beyond the mean, for which torques are in force
         # Models for an estimator that loses samples.
         ("covariance", "f8", (MAX_FILTERS, 3, 3)),
         ("transition", "f8", (MAX_FILTERS, 3, 3)),
@@ -260,7 +261,7 @@ def reset_bank(bank: NDArray[np.void], y: float) -> None:
     bank["at_rest"] = 0
     bank["sampled"], bank["equal"], bank["lively_left"] = y, 0, 0
     # None of either: the first cycle sets what depends on them.
-    bank["delay_in_force"], bank["pace"] = -1.0, -1
+    bank["delay_in_force"], bank["pace"], bank["age"] = -1.0, -1, 0.0
 
 
 @compiled
@@ -332,13 +333,18 @@ def _follow_delay(bank: Record, estimator: Record) -> bool:
         return False
     bank.delay_in_force = delay
     set_model_delay(estimator, delay)
-    share = delay - int(delay)
+    _set_share(bank, delay - int(delay) - bank.age)
+    return True
+
+
+@compiled
+def _set_share(bank: Record, share: float) -> None:
+    """Let torques act after this share of a period; a little before it and after it, too."""
     older, newer = bank.older_by_share, bank.newer_by_share
     for k in range(2):
         for i in range(bank.count):
             bank.older[k, i] = older[0, k, i] + share * (older[1, k, i] + share * older[2, k, i])
             bank.newer[k, i] = newer[0, k, i] + share * (newer[1, k, i] + share * newer[2, k, i])
-    return True
 
 
 @compiled
@@ -443,15 +449,19 @@ def _set_covariance(bank: Record, estimator: Record, i: int) -> None:
 
 
 @compiled
-def predict_bank(bank: Record, estimator: Record, force: float) -> None:
+def predict_bank(bank: Record, estimator: Record, force: float, age: float = 0.0) -> None:
     """Advance all filters to the next sample; call before `predict` of the estimator.
 
-    force: as in `predict`.
+    force: as in `predict`. age: that of this sample beyond the mean [periods]; torques act as much
+    earlier after it.
     """
+    if age != bank.age:
+        bank.age = age
+        _set_share(bank, bank.delay_in_force - int(bank.delay_in_force) - age)
     n = estimator.delay_periods
     older = estimator.in_flight[n]
     newer = force if n == 0 else estimator.in_flight[n - 1]
-    predict_regression(bank.regression[0], estimator.in_flight, force)
+    predict_regression(bank.regression[0], estimator.in_flight, force, age)
     put_probe_in_flight(bank.regression[0], force)
     state, phi = bank.state, bank.phi
     for i in range(bank.count):

@@ -315,6 +315,26 @@ def predict(estimator: Record, force: float) -> None:
 
 
 @compiled
+def unit_motion(
+    in_flight: NDArray[np.float64], force: float, delay: float, period: float
+) -> tuple[float, float, float, float]:
+    """Return way and speed of a unit mass by the forces of a period, and what a later one changes.
+
+    in_flight: newest first, at the end of the period `force` will be, too. delay: D in periods, at
+    which they act; a force that is later by δ periods adds δ times the last two.
+    """
+    n = int(delay)
+    share = delay - n
+    rest = 1.0 - share
+    older = in_flight[n]
+    newer = force if n == 0 else in_flight[n - 1]
+    t = period
+    way = t * t * (share * (1.0 - 0.5 * share) * older + 0.5 * rest * rest * newer)
+    speed = t * (share * older + rest * newer)
+    return way, speed, t * t * rest * (older - newer), t * (older - newer)
+
+
+@compiled
 def _put_in_flight(estimator: Record, force: float) -> None:
     for age in range(MAX_DELAY, 0, -1):
         estimator.in_flight[age] = estimator.in_flight[age - 1]

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
-from canwall.walls.estimator import MAX_DELAY
+from canwall.walls.estimator import MAX_DELAY, unit_motion
 from canwall.walls.shaft import ElasticShaft
 
 #: Number of samples that are kept: two differences give the velocity to come.
@@ -465,17 +465,16 @@ def mean_above_zero(mean: float, deviation: float) -> float:
 
 
 @compiled
-def predict_regression(regression: Record, in_flight: NDArray[np.float64], force: float) -> None:
-    """Advance the observer by a period, at the end of which `force` will be in flight, too."""
+def predict_regression(
+    regression: Record, in_flight: NDArray[np.float64], force: float, age: float
+) -> None:
+    """Advance the observer by a period, at the end of which `force` will be in flight, too.
+
+    age: that of the sample at its begin beyond the mean [periods]; torques act as much earlier.
+    """
     t, x, excess = regression.period, regression.observed, regression.excess
-    delay = min(max(regression.delay + excess, 0.0), float(MAX_DELAY))
-    n = int(delay)
-    share = delay - n
-    rest = 1.0 - share
-    older = in_flight[n]
-    newer = force if n == 0 else in_flight[n - 1]
-    way = t * t * (share * (1.0 - 0.5 * share) * older + 0.5 * rest * rest * newer)
-    speed = t * (share * older + rest * newer)
+    delay = min(max(regression.delay + excess - age, 0.0), float(MAX_DELAY))
+    way, speed, later_way, later_speed = unit_motion(in_flight, force, delay, t)
     if regression.rotor > 0.0:
         regression.bend = regression.begun + way
         regression.begun = t * speed - way
@@ -483,9 +482,7 @@ def predict_regression(regression: Record, in_flight: NDArray[np.float64], force
     for c in range(5):
         x[0, c] += t * x[1, c] + 0.5 * t * t * x[2, c]
         x[1, c] += t * x[2, c]
-    # What the torque does changes with its delay by this; torque and delay are regressed on
-    # as they are at the delay that was told.
-    later_way, later_speed = t * t * rest * (older - newer), t * (older - newer)
+    # Torque and delay are regressed on as they are at the delay that was told.
     x[0, 1] += way - excess * later_way
     x[1, 1] += speed - excess * later_speed
     x[0, 4] += later_way

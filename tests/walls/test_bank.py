@@ -90,6 +90,24 @@ def pulses(size: float) -> NDArray[np.float64]:
     return torques
 
 
+@pytest.mark.parametrize("age", [0.1, -0.2])
+def test_torque_after_an_old_sample_acts_earlier(age: float) -> None:
+    states = []
+    for delay, beyond in ((DELAY, age), (DELAY - age, 0.0)):
+        bank, estimator = bank_at(0.0)
+        set_bank(bank, MASSES, VISCOUS, 0.0, PERIOD, COUNT, WALK, delay)
+        reset_bank(bank, 0.0)
+        set_pace(bank[0], 1e9)
+        set_estimator(estimator, MASSES[0], VISCOUS[0], 0.0, 0.0, PERIOD, COUNT, WALK, delay)
+        estimator["in_flight"][0, :3] = 0.3, -0.1, 0.2
+        correct_bank(bank[0], estimator[0], 0.0)
+        for j in range(3):
+            predict_bank(bank[0], estimator[0], 0.1 * j, beyond)
+        states.append(bank["state"][0])
+    assert states[0][1, 0] != 0.0
+    np.testing.assert_allclose(states[0], states[1], rtol=1e-9, atol=1e-15)
+
+
 @pytest.mark.parametrize("mass", [1.3e-4, 4.2e-4, 1.4e-3, 3.6e-3])
 def test_mass_is_found_within_samples_of_the_first_torque(mass: float) -> None:
     found = play(*bank_at(0.0), mass, pulses(max(0.4, 300.0 * mass)))

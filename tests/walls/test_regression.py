@@ -9,7 +9,7 @@ from scipy.signal import place_poles
 from scipy.stats import truncnorm
 
 from canwall.physics import advance, make_plant
-from canwall.walls import ESTIMATOR, WALL
+from canwall.walls import ESTIMATOR, MAX_DELAY, WALL
 from canwall.walls.regression import (
     REGRESSION,
     begin_regression,
@@ -40,7 +40,7 @@ def mass_known(regression: NDArray[np.void], before: float) -> float:
 
 def send(regression: NDArray[np.void], estimator: NDArray[np.void], torque: float) -> None:
     """Send a torque that acts at once."""
-    predict_regression(regression[0], estimator["in_flight"][0], torque)
+    predict_regression(regression[0], estimator["in_flight"][0], torque, 0.0)
     estimator["in_flight"][0] = np.roll(estimator["in_flight"][0], 1)
     estimator["in_flight"][0, 0] = torque
 
@@ -269,3 +269,16 @@ def test_probe_is_as_strong_as_the_mass_that_is_found_wants(
     v = np.cumsum(torques) * PERIOD
     assert np.ptp(v[8:]) == pytest.approx(4.0 * PERIOD * stronger * 0.0048)
     assert np.max(v[8:]) == pytest.approx(-np.min(v[8:]))
+
+
+def test_torque_after_an_old_sample_acts_earlier() -> None:
+    in_flight = np.array([0.1, -0.2, 0.3] + [0.0] * (MAX_DELAY - 2))
+    states = []
+    for delay, age in ((1.35, 0.1), (1.25, 0.0)):
+        regression = np.zeros(1, REGRESSION)
+        set_regression(regression[0], LIGHTEST, PERIOD, COUNT, delay)
+        reset_regression(regression[0], 0.0)
+        predict_regression(regression[0], in_flight, 0.4, age)
+        states.append(regression["observed"][0])
+    assert states[0][0, 1] != 0.0
+    np.testing.assert_allclose(states[0], states[1], rtol=1e-12)
