@@ -15,9 +15,10 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from fill_tables import filled
+
 from canwall.config import Settings, load, with_overrides
 from canwall.sweep import OPERATORS, Operator
-from fill_tables import filled
 
 ROOT = Path(__file__).parents[1]
 CONFIG = ROOT / "config" / "sim.toml"
@@ -57,8 +58,11 @@ def struck(operator: Operator, bus: dict[str, Any], first_s: float) -> Settings:
         "press_s": 0.5,
         "withdraw_s": 0.1,
     }
-    keys = {f"simulation.hand.{key}": value for key, value in hand.items()}
-    wall = {"wall.stiffness_nm_per_rad": STIFFNESS, "run.duration_s": first_s + STRIKES * INTERVAL_S}
+    keys: dict[str, Any] = {f"simulation.hand.{key}": value for key, value in hand.items()}
+    wall = {
+        "wall.stiffness_nm_per_rad": STIFFNESS,
+        "run.duration_s": first_s + STRIKES * INTERVAL_S,
+    }
     settings = with_overrides(load(CONFIG), {**operator.keys, **keys, **wall, **bus})
     return settings.model_copy(update={"schedule": ()})
 
