@@ -97,6 +97,8 @@ def row(
 ) -> list[str]:
     """Return what the table says of a run; depth: that of the referent's first strikes [rad]."""
     strikes = summary["strikes"]
+    if not strikes:
+        return [operator.name, "–", "–", "–", "–", str(summary["missed_tpdo"]), "–"]
     mass = inertia + operator.inertia_kg_m2
     deepest = max(strike["first_depth_rad"] for strike in strikes) / depth
     masses = sorted(s["mass_est_kg_m2"] / mass for s in strikes)

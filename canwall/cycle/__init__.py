@@ -8,7 +8,6 @@ from canwall.cycle.laws import named_law, run_laws, with_law
 from canwall.cycle.loop import Loop, WallGivenUpError
 from canwall.cycle.machine import real_time_machine
 from canwall.cycle.python_can import PythonCanTransport
-from canwall.cycle.realtime import Grant, real_time_priority
 from canwall.cycle.sockets import SocketTransport
 from canwall.cycle.state import (
     CYCLE,
@@ -26,6 +25,7 @@ from canwall.cycle.timing import observe_ns
 from canwall.cycle.transport import CycleFrames, Transport
 from canwall.cycle.trips import Trip
 from canwall.cycle.way_out import Outcome, run_loop
+from canwall.realtime import Grant, real_time_priority
 from canwall.record.histogram import HISTOGRAM, buckets_ns, percentile_ns, timing_summary
 
 __all__ = [

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from canwall.cycle.realtime import Grant, limits_line, real_time_priority
+from canwall.realtime import Grant, limits_line, real_time_priority
 
 #: sys/mman.h. Only touched pages are locked, because libraries map far more than they use.
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4

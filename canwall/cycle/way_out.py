@@ -16,9 +16,9 @@ import can
 
 from canwall.cycle.exchange import Exchange
 from canwall.cycle.loop import Loop, WallGivenUpError
-from canwall.cycle.realtime import Grant, real_time_priority
 from canwall.drive import DriveError
 from canwall.errors import RunFailedError
+from canwall.realtime import Grant, real_time_priority
 from canwall.supervised import Call
 
 #: Attempts to send NMT RESET NODE.

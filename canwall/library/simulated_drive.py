@@ -5,6 +5,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -15,6 +16,7 @@ from canwall.bus import open_bus
 from canwall.config import Bus, Drive, Fault, Settings, Simulation, first_error, shipped
 from canwall.errors import ConfigError
 from canwall.faults import KINDS, FaultKind
+from canwall.realtime import real_time_priority
 from canwall.simdrive import (
     BusRunner,
     FaultyDrive,
@@ -72,6 +74,7 @@ class SimulatedDrive:
         simulation: Mapping[str, Any] | None = None,
         rated_torque_unit_nm: float | None = None,
         report: Callable[[str], None] = _log.info,
+        prompt: bool = False,
     ) -> None:
         """Describe the drive, which is on no bus yet.
 
@@ -90,6 +93,8 @@ class SimulatedDrive:
                 handle unless `hand` is given.
             rated_torque_unit_nm: As in `[drive]`.
             report: Called with a line when a fault begins or ends, or the bus goes or comes back.
+            prompt: With real_time, give its thread real-time priority, if that is allowed: a drive
+                answers in time, however busy the machine is.
 
         Raises:
             ConfigError: If an argument is not valid.
@@ -118,6 +123,7 @@ class SimulatedDrive:
         self._stop = threading.Event()
         self._failure: BaseException | None = None
         self._thread: threading.Thread | None = None
+        self._prompt = prompt and self._device.real_time
 
     @classmethod
     def from_settings(
@@ -142,6 +148,7 @@ class SimulatedDrive:
             simulation=simulation.model_dump(),
             rated_torque_unit_nm=settings.drive.rated_torque_unit_nm,
             report=report,
+            prompt=True,
         )
 
     def __enter__(self) -> Self:
@@ -190,7 +197,8 @@ class SimulatedDrive:
 
     def _serve(self, runner: BusRunner) -> None:
         try:
-            runner.run(self._stop.is_set)
+            with real_time_priority(above_loop=True) if self._prompt else nullcontext():
+                runner.run(self._stop.is_set)
         except BaseException as error:
             self._failure = error
 

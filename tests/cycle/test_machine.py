@@ -9,9 +9,10 @@ from typing import Any
 
 import pytest
 
-from canwall.cycle import Grant, machine, realtime
+from canwall import realtime
+from canwall.cycle import Grant, machine
 from canwall.cycle.machine import real_time_machine
-from canwall.cycle.realtime import real_time_priority
+from canwall.realtime import real_time_priority
 
 
 def state() -> tuple[object, ...]:
