@@ -35,8 +35,9 @@ HEADER = (
     "bus; time of the drive",
     "operator",
     "chatter",
-    "felt ripple [N]",
-    "first depth ÷ referent",
+    "largest felt ripple [N]",
+    "contacts of a strike, most",
+    "first depth ÷ referent: median, most",
     "mass found ÷ true",
     "lost TPDOs",
     "SYNC off by, p99 [µs]",
@@ -92,27 +93,26 @@ def run(settings: Settings, real_time: bool) -> dict[str, Any]:
         return dict(json.loads((record / "summary.json").read_text(encoding="utf-8")))
 
 
-def row(
-    operator: Operator, summary: dict[str, Any], depth: float, inertia: float, period: float
-) -> list[str]:
+def row(operator: Operator, summary: dict[str, Any], depth: float, inertia: float) -> list[str]:
     """Return what the table says of a run; depth: that of the referent's first strikes [rad]."""
-    strikes = summary["strikes"]
+    strikes, lost = summary["strikes"], str(summary["missed_tpdo"])
     if not strikes:
-        return [operator.name, "–", "–", "–", "–", str(summary["missed_tpdo"]), "–"]
+        return [operator.name, "no strike", *4 * ["–"], lost, "–"]
     mass = inertia + operator.inertia_kg_m2
-    deepest = max(strike["first_depth_rad"] for strike in strikes) / depth
-    masses = sorted(s["mass_est_kg_m2"] / mass for s in strikes)
-    chatter = sum(strike["chatter"] for strike in strikes)
-    off = summary["timing"]["sync_interval"]
-    late = f"{off['p99_us'] - 1e6 * period:.0f}" if measured(summary) else "–"
+    depths = sorted(strike["first_depth_rad"] / depth for strike in strikes)
+    masses = sorted(strike["mass_est_kg_m2"] / mass for strike in strikes)
+    # Without a referent every bounce counts, those of the continuous wall as well.
+    chatter = f"{sum(strike['chatter'] for strike in strikes)} of {len(strikes)}"
+    off = summary["timing"].get("sync_error")
     return [
         operator.name,
-        f"{chatter} of {len(strikes)}",
-        f"{max(s['felt_ripple_n'] for s in strikes):.2f}",
-        f"{deepest:.2f}",
+        f"– of {len(strikes)}" if measured(summary) else chatter,
+        f"{max(strike['felt_ripple_n'] or 0.0 for strike in strikes):.2f}",
+        str(max(strike["contacts"] for strike in strikes)),
+        f"{depths[len(depths) // 2]:.2f}, {depths[-1]:.2f}",
         f"{masses[0]:.2f} to {masses[-1]:.2f}",
-        str(summary["missed_tpdo"]),
-        late,
+        lost,
+        f"{off['p99_us']:.0f}" if off and measured(summary) else "–",
     ]
 
 
@@ -162,8 +162,8 @@ def strike_over(name: str, real_time: bool, results: Path, socket: Path) -> None
         # In measured time the hand's begin is not known, and with it the referent's phase.
         alike = run(struck(operator, {}, FIRST_S), False) if real_time else summary
         depth = max(strike["referent_first_depth_rad"] for strike in alike["strikes"])
-        inertia, period = settings.simulation.inertia_kg_m2, settings.bus.cycle_s
-        rows.append([title, *row(operator, summary, depth, inertia, period)])
+        inertia = settings.simulation.inertia_kg_m2
+        rows.append([title, *row(operator, summary, depth, inertia)])
         print(" | ".join(rows[-1]), file=sys.stderr, flush=True)
     kept = results / f"{name}-{'measured' if real_time else 'simulated'}.json"
     kept.write_text(json.dumps(rows, ensure_ascii=False), encoding="utf-8")
