@@ -19,6 +19,7 @@ from canwall.walls import (
     ESTIMATOR,
     LATCH,
     MAX_DELAY,
+    SHORTEST_DELAY,
     TENSION,
     WALL,
     ElasticShaft,
@@ -52,9 +53,8 @@ SYNCHRONOUS_DELAY = 1.0
 _FORCE_WALK = 0.2
 #: Largest bandwidth of a filter on an elastic shaft, as a part of the resonance.
 _FILTER_PART = 0.125
-#: Bandwidth of the filter of the lightest hand, over that of one which follows within the delay,
-#: and the delay below which it becomes no quicker [periods].
-_QUICKNESS, _SHORTEST_DELAY = 0.85, 0.5
+#: Bandwidth of the filter of the lightest hand, over that of one which follows within the delay.
+_QUICKNESS = 0.85
 #: What the model has more than the delay that is told where the hand is unknown [periods].
 _DELAY_MARGIN = 0.1
 #: Missed motion below this is ignored, since a coarse encoder stays on one count for long [counts].
@@ -272,7 +272,7 @@ def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None
     if settings.operator.adapt:
         masses, dampings = _hands(settings)
         mass, viscous, coulomb = masses[0], dampings[0], 0.0
-        bandwidth = min(bandwidth, _QUICKNESS / (max(delay, _SHORTEST_DELAY) * period))
+        bandwidth = min(bandwidth, _QUICKNESS / (max(delay, SHORTEST_DELAY) * period))
     if force_walk is None:
         force_walk = _FORCE_WALK
         if bandwidth < math.inf:
@@ -329,7 +329,7 @@ def _bound_by_shaft(cycle: NDArray[np.void]) -> None:
     n = bank["count"].item()
     for i in range(n):
         mass = math.exp(bank["log_lightest"] + i * bank["log_step"])
-        gain = tuple(bank["paces"][0, :3, i].tolist())
+        gain = tuple(bank["steady_gain"][:, i].tolist())
         loop = WallLoop(mass, bank["viscous"][i].item(), gain, *closing)
         bank["stiffest"][i] = stiffest_wall(shaft, loop)
     if n:

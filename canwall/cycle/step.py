@@ -22,6 +22,7 @@ from canwall.walls import (
     change_plant,
     correct,
     correct_bank,
+    doubt,
     end_lag,
     expect_torques,
     likelier,
@@ -135,6 +136,7 @@ def _identify_operator(cycle: Record, sample: float) -> None:
         if cycle.compares_lag:
             set_model(cycle.lagging[0], estimator.mass, estimator.viscous, bank.spring)
             set_model(cycle.losing[0], estimator.mass, estimator.viscous, bank.spring)
+    cycle.rendered[0].wall[0].doubt = doubt(bank)
 
 
 @compiled

@@ -58,11 +58,13 @@ BANK = np.dtype(
         ("state", "f8", (3, MAX_FILTERS)),
         ("gain", "f8", (3, MAX_FILTERS)),
         # Gains, `with_velocity` and `equal_samples` for softer and softer walls, each half as stiff
-        # as the one before, and for a handle that moves; stiffness of the first, and number of the
-        # one in force.
-        ("paces", "f8", (_PACES + 1, 6, MAX_FILTERS)),
+        # as the one before, and for a handle that moves, as parabolas over the bandwidth relative
+        # to that for the delay as told; stiffness of the first, number of the one in force, and
+        # that relative bandwidth.
+        ("paces", "f8", (3, _PACES + 1, 6, MAX_FILTERS)),
         ("steadiest", "f8"),
         ("pace", "i8"),
+        ("quicker", "f8"),
         # Samples for which a handle that moved is followed quickly, and those that are left.
         ("lively", "i8"),
         ("lively_left", "i8"),
@@ -88,6 +90,7 @@ BANK = np.dtype(
         ("delay_in_force", "f8"),
         ("age", "f8"),  # of the sample, beyond the mean, for which torques are in force
         # Models for an estimator that loses samples.
+        ("steady_gain", "f8", (3, MAX_FILTERS)),
         ("covariance", "f8", (MAX_FILTERS, 3, 3)),
         ("transition", "f8", (MAX_FILTERS, 3, 3)),
         ("scale", "f8", (MAX_FILTERS, 3)),
@@ -100,6 +103,7 @@ BANK = np.dtype(
         ("at_rest", "i8"),  # samples without torque in a row
         ("forgotten", "i8"),  # of those after which the hand may be another one
         ("mass", "f8"),
+        ("known", "?"),  # the mass has been found, and is not another hand's
         ("spread", "f8"),  # standard deviation of ln(mass), as far as the residuals tell
     ],
     align=True,
@@ -115,15 +119,28 @@ _FOLLOWED = 0.6
 #: breaks loose slips far, and friction and the bias force hunt.
 _AS_QUICK, _STEADINESS = 3.0, 0.52
 #: K·T²/m from which on a filter is at its steadiest, and the power of the stiffness with which its
-#: bandwidth rises below, up to the lightest one's: on a soft wall noise is felt less, and a filter
-#: that is slower than the wall makes a heavy hand bounce.
-_STEADIEST, _QUICKENING = 0.5, 1.0 / 6.0
+#: bandwidth rises below, up to the lightest one's, and for walls softer by a factor no further: on
+#: a soft wall noise is felt less, and a filter slower than the wall makes a heavy hand bounce.
+_STEADIEST, _QUICKENING, _SOFTEST = 1.0, 1.0 / 6.0, 16.0
+#: Bandwidth of the lightest filter for a handle at rest, as a part of that for one in motion, and
+#: mass over the lightest one from which on both are the same. Friction adds damping, the more the
+#: smaller the motion: a loop that some damping makes unstable goes on swinging in friction, as that
+#: of a quick filter does with a mass that has little damping of its own.
+_CALM, _CALM_UP_TO = 0.75, 1.25
+#: Bandwidths relative to that for the delay as told, for which filters have gains, and the change
+#: that is worth others.
+_QUICKER, _WORTH = (0.75, 1.0, 1.4), 0.015
+#: Shortest delay that makes filters quicker [periods].
+SHORTEST_DELAY = 0.5
 #: Least way of a handle that moves [counts a sample], and the time after it for which all filters
 #: are as quick as the lightest [s]: noise is felt at rest alone, and a filter that is slow to find
 #: the push after a blow makes a heavy hand bounce.
 _MOVES, _LIVELY_S = 6.0, 0.2
-#: Deviation of the mass below which the handle is probed no harder for coming fast.
+#: Deviation of ln(mass) below which the mass counts as known.
 _KNOWN_SPREAD = 0.2
+#: Growth in a period of ln(mass) once it was known and no longer is: a hand that lets go within
+#: milliseconds looks heavy at first, and the wall would throw the handle back.
+_GROWTH_IN_DOUBT = 0.1
 #: Share of half a count within which a reading does not contradict the prediction of a heavy hand,
 #: whose motion between two samples is known better than that. A light one needs each correction.
 _WITHIN = 0.8
@@ -189,33 +206,51 @@ def set_bank(
         walk, heavier, slower = force_walk, float(masses[i] / masses[0]), 1.0
         if shaft is None:
             light = min(1.0, _AS_QUICK / heavier)
-            slower = light**_STEADINESS
+            calm = min((heavier - 1.0) / (_CALM_UP_TO - 1.0), 1.0)
+            slower = light**_STEADINESS * (_CALM + (1.0 - _CALM) * calm)
             walk *= heavier * slower**3  # by the cube of the bandwidth
             bank["within"][0, i] = 0.5 * _WITHIN * (1.0 - light) * abs(count)
-        model = kalman_model(*plant, count, walk)
-        quickest = kalman_model(*plant, count, walk / slower**3)
-        _set_filter(bank[0], i, model)
-        _set_paces(bank[0], i, model, quickest, slower, period)
+        _set_filter(bank[0], i, kalman_model(*plant, count, walk))
+        _set_paces(bank[0], i, plant, count, walk, slower, follows_delay=shaft is None)
         _set_torques(bank[0], i, *plant)
 
 
 def _set_paces(
     bank: np.void,
     i: int,
-    model: KalmanModel,
-    quickest: KalmanModel,
+    plant: tuple[float, float, float, float],
+    count: float,
+    walk: float,
     slower: float,
-    period: float,
+    follows_delay: bool,
 ) -> None:
-    """Write the gains of a filter and what rest tells it, up to being as quick as the lightest."""
-    steadiest = bank["steadiest"] * math.exp(bank["log_step"] * (i + 1 - bank["count"]))
-    steady = np.concatenate([model.gain, _rest(model, period)])
-    quick = np.concatenate([quickest.gain, _rest(quickest, period)])
-    for k in range(_PACES + 1):
-        softer = max(steadiest / bank["steadiest"] * 2.0**k, 1.0)
-        quicker = 1.0 / slower if k == _PACES else min(softer**_QUICKENING, 1.0 / slower)
-        share = math.log(quicker) / -math.log(slower) if slower < 1.0 else 0.0
-        bank["paces"][k, :, i] = steady * (quick / steady) ** share
+    """Write the gains of a filter and what rest tells it.
+
+    Its bandwidth goes with that of the delay, and up to being as quick as the lightest.
+    """
+    period = plant[-1]
+    paces = np.zeros((len(_QUICKER), _PACES + 1, 6))
+    for k, quicker in enumerate(_QUICKER if follows_delay else [1.0] * len(_QUICKER)):
+        steady = _gain_and_rest(kalman_model(*plant, count, walk * quicker**3), period)
+        quick = _gain_and_rest(kalman_model(*plant, count, walk * (quicker / slower) ** 3), period)
+        for pace, share in enumerate(_shares(bank, i, slower)):
+            paces[k, pace] = steady * (quick / steady) ** share
+    bank["paces"][:, :, :, i] = _parabolas(np.array(_QUICKER), paces)
+
+
+def _shares(bank: np.void, i: int, slower: float) -> list[float]:
+    """Return the share of the way from a filter's steadiest gains to its quickest, by pace."""
+    if slower == 1.0:
+        return [0.0] * (_PACES + 1)
+    steadiest = math.exp(bank["log_step"] * (i + 1 - bank["count"]))
+    softer = [min(max(steadiest * 2.0**k, 1.0), _SOFTEST) for k in range(_PACES)]
+    shares = [_QUICKENING * math.log(each) / -math.log(slower) for each in softer]
+    return [*(min(share, 1.0) for share in shares), 1.0]
+
+
+def _parabolas(at: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return c with c₀ + c₁·x + c₂·x² through three values, shape (3, ...), each."""
+    return np.tensordot(np.linalg.inv(np.vander(at, increasing=True)), values, 1)
 
 
 def _set_torques(
@@ -230,25 +265,25 @@ def _set_torques(
         _, before = zoh(mass, viscous, spring, share * period)
         phi_after, newer[k] = zoh(mass, viscous, spring, (1.0 - share) * period)
         older[k] = phi_after @ before
-    to_parabola = np.linalg.inv(np.vander(shares, increasing=True))
-    bank["older_by_share"][:, :, i] = to_parabola @ older
-    bank["newer_by_share"][:, :, i] = to_parabola @ newer
+    bank["older_by_share"][:, :, i] = _parabolas(shares, older)
+    bank["newer_by_share"][:, :, i] = _parabolas(shares, newer)
 
 
 def _set_filter(bank: np.void, i: int, model: KalmanModel) -> None:
+    bank["steady_gain"][:, i] = model.gain
     bank["covariance"][i], bank["transition"][i] = model.covariance, model.transition
     bank["scale"][i], bank["force_noise"][i] = model.scale, model.force_noise
 
 
-def _rest(model: KalmanModel, period: float) -> NDArray[np.float64]:
-    """Return what equal samples say of a filter, by its covariance after a sample.
+def _gain_and_rest(model: KalmanModel, period: float) -> NDArray[np.float64]:
+    """Return the gain of a filter, and what equal samples say by its covariance after a sample.
 
-    Corrections of position and force for one of the velocity, and the number of samples.
+    Those are corrections of position and force for one of the velocity, and the number of samples.
     """
     scale, prior = model.scale, model.covariance
     after = prior - np.outer(model.gain / scale * scale[0], prior[0])
     with_velocity = after[[0, 2], 1] / after[1, 1] * scale[[0, 2]] / scale[1]
-    return np.append(with_velocity, _EQUAL * scale[0] / (scale[1] * period))
+    return np.array([*model.gain, *with_velocity, _EQUAL * scale[0] / (scale[1] * period)])
 
 
 def reset_bank(bank: NDArray[np.void], y: float) -> None:
@@ -256,12 +291,13 @@ def reset_bank(bank: NDArray[np.void], y: float) -> None:
     bank["state"] = 0.0
     bank["state"][:, 0] = y
     reset_regression(bank["regression"][0, 0], y)
-    bank["place"], bank["spread"] = 0.0, 0.0
+    bank["place"], bank["spread"], bank["known"] = 0.0, 0.0, False
     bank["mass"] = np.exp(bank["log_lightest"])
     bank["at_rest"] = 0
     bank["sampled"], bank["equal"], bank["lively_left"] = y, 0, 0
     # None of either: the first cycle sets what depends on them.
     bank["delay_in_force"], bank["pace"], bank["age"] = -1.0, -1, 0.0
+    bank["quicker"] = 1.0
 
 
 @compiled
@@ -313,15 +349,26 @@ def set_pace(bank: Record, stiffness: float) -> None:
         pace = _PACES
     elif stiffness > 0.0:
         pace = min(max(int(math.log2(bank.steadiest / stiffness)), 0), pace)
-    if pace == bank.pace:
+    quicker = bank.quicker
+    if bank.delay_in_force >= 0.0:
+        quicker = max(bank.delay, SHORTEST_DELAY) / max(bank.delay_in_force, SHORTEST_DELAY)
+        quicker = min(max(quicker, _QUICKER[0]), _QUICKER[2])
+    if pace == bank.pace and abs(quicker - bank.quicker) < _WORTH:
         return
-    bank.pace = pace
-    values = bank.paces[pace]
+    bank.pace, bank.quicker = pace, quicker
     for i in range(bank.count):
         for c in range(3):
-            bank.gain[c, i] = values[c, i]
-        bank.with_velocity[0, i], bank.with_velocity[1, i] = values[3, i], values[4, i]
-        bank.equal_samples[i] = values[5, i] if values[5, i] <= _EQUAL_SAMPLES else math.inf
+            bank.gain[c, i] = _paced(bank, c, i)
+        bank.with_velocity[0, i], bank.with_velocity[1, i] = _paced(bank, 3, i), _paced(bank, 4, i)
+        equal_samples = _paced(bank, 5, i)
+        bank.equal_samples[i] = equal_samples if equal_samples <= _EQUAL_SAMPLES else math.inf
+
+
+@compiled
+def _paced(bank: Record, quantity: int, i: int) -> float:
+    """Return a quantity of filter i for the pace in force."""
+    c, pace, x = bank.paces, bank.pace, bank.quicker
+    return c[0, pace, quantity, i] + x * (c[1, pace, quantity, i] + x * c[2, pace, quantity, i])
 
 
 @compiled
@@ -401,6 +448,10 @@ def _follow(bank: Record) -> bool:
         # Rotor and load together.
         likeliest /= 1.0 + bank.regression[0].rotor * likeliest
     step = _FOLLOWED * (_place_of(bank, likeliest) - bank.place)
+    if bank.spread < _KNOWN_SPREAD:
+        bank.known = True
+    elif bank.known:
+        step = min(step, _GROWTH_IN_DOUBT / bank.log_step)
     bank.place += step
     bank.mass = _mass_at(bank, bank.place)
     return step != 0.0
@@ -410,7 +461,7 @@ def _follow(bank: Record) -> bool:
 def _forget(bank: Record) -> bool:
     """Begin with the lightest hand again; return True if another one was in force."""
     changed = bank.place != 0.0
-    bank.place, bank.spread = 0.0, 0.0
+    bank.place, bank.spread, bank.known = 0.0, 0.0, False
     bank.mass = _mass_at(bank, 0.0)
     return changed
 
@@ -438,6 +489,14 @@ def stiffest(bank: Record) -> float:
 
 
 @compiled
+def doubt(bank: Record) -> float:
+    """Return the doubt about the mass in force, from 0 to 1: the deviation of ln(mass)."""
+    if bank.holds:
+        return 0.0
+    return min(bank.spread, 1.0) if bank.spread > 0.0 else 1.0
+
+
+@compiled
 def _set_covariance(bank: Record, estimator: Record, i: int) -> None:
     """Give the estimator the gain and the covariance of filter i, for a gap of samples."""
     estimator.steady_covariance[:] = bank.covariance[i]
@@ -445,7 +504,7 @@ def _set_covariance(bank: Record, estimator: Record, i: int) -> None:
     estimator.scale[:] = bank.scale[i]
     estimator.force_noise = bank.force_noise[i]
     for c in range(3):
-        estimator.steady_gain[c] = estimator.gain[c] = bank.paces[0, c, i]
+        estimator.steady_gain[c] = estimator.gain[c] = bank.steady_gain[c, i]
 
 
 @compiled

@@ -63,6 +63,8 @@ WALL = np.dtype(
         ("asked_stiffness", "f8"),
         ("asked_damping", "f8"),
         ("damping_ratio", "f8"),
+        # By how much larger ζ is in force, relatively, as long as the mass is in doubt.
+        ("doubt", "f8"),
         ("cap", "f8"),
         # Where there is a cap: the largest stiffness on an elastic shaft with the mass in force.
         ("stiffest", "f8"),
@@ -249,7 +251,8 @@ def put_in_force(wall: Record) -> None:
         allowed = capped_stiffness(stiffness, wall.cap, wall.mass, wall.period)
         stiffness = min(allowed, wall.stiffest, growth * wall.stiffness)
     wall.stiffness = stiffness
-    wall.damping = damping_of_ratio(wall.asked_damping, wall.damping_ratio, stiffness, wall.mass)
+    ratio = wall.damping_ratio * (1.0 + wall.doubt)
+    wall.damping = damping_of_ratio(wall.asked_damping, ratio, stiffness, wall.mass)
 
 
 @compiled
