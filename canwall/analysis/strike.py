@@ -165,8 +165,8 @@ def measure_strike(
     into.penetration = max(-y.min(), 0.0) if len(y) else 0.0
     into.first_depth = first_depth(y)
     into.referent_first_depth = first_depth(referent)
-    speed, into.restitution = first_bounce(y, force, period)
-    _, into.referent_restitution = first_bounce(referent, np.zeros(len(referent)), period)
+    speed, into.restitution = first_bounce(y, period)
+    _, into.referent_restitution = first_bounce(referent, period)
     into.rate_hardness = math.nan
     if speed < 0.0 and first + SPAN < len(force):
         into.rate_hardness = -(force[first + SPAN] - force[first]) / (SPAN * period) / speed
@@ -241,21 +241,22 @@ def first_depth(y: Array) -> float:
 
 
 @compiled
-def first_bounce(y: Array, force: Array, period: float) -> tuple[float, float]:
+def first_bounce(y: Array, period: float) -> tuple[float, float]:
     """Return the speed into the first contact and the restitution; NaN if there is none.
 
-    Speeds are means over the SPAN samples before the contact, which begins with the force of a wall
-    that acts ahead of its surface, and after the handle has left it.
+    Speeds are means over SPAN samples. That of the approach is the fastest of those which end
+    within the last SPAN samples before the contact, since a wall may act ahead of its surface; that
+    on leaving is over the first samples outside.
     """
     enter = 0
-    while enter < len(y) and not _touches(y[enter], force[enter]):
+    while enter < len(y) and y[enter] >= 0.0:
         enter += 1
     if enter <= SPAN or enter >= len(y):
         return math.nan, math.nan
-    speed = (y[enter - 1] - y[enter - 1 - SPAN]) / (SPAN * period)
+    speed = math.inf
+    for j in range(max(enter - SPAN, SPAN), enter):
+        speed = min(speed, (y[j] - y[j - SPAN]) / (SPAN * period))
     leave = enter
-    while leave < len(y) and y[leave] >= 0.0:
-        leave += 1
     while leave < len(y) and y[leave] < 0.0:
         leave += 1
     if leave + SPAN >= len(y) or not speed < 0.0:

@@ -125,7 +125,7 @@ def _strike(
     amplitude, frequency = metrics.limit_cycle(inside, period) if verdict.chatters else (0.0, 0.0)
     if verdict.by == "ripple":  # it may be felt within one count
         _, frequency = metrics.limit_cycle(force[judged], period)
-    around = slice(max(start - SPAN - 1, 0), cycles.stop + SPAN)
+    around = slice(max(start - 2 * SPAN, 0), cycles.stop + SPAN)
     return {
         "start_s": start * period,
         "end_s": cycles.stop * period,
@@ -137,7 +137,7 @@ def _strike(
         "referent_first_depth_rad": _known(
             math.nan if referent is None else first_depth(referent[cycles])
         ),
-        "restitution": _known(first_bounce(y[around], force[around], period)[1]),
+        "restitution": _known(first_bounce(y[around], period)[1]),
         "peak_force_nm": float(force[cycles].max(initial=0.0)),
         "energy_out_j": float(running[-1]),
         "energy_out_max_j": float(running.max()),

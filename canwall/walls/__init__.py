@@ -7,10 +7,8 @@ out of it. Nothing here knows of CAN, counts or drives.
 from canwall.walls.bank import (
     BANK,
     MAX_FILTERS,
-    SHORTEST_DELAY,
     correct_bank,
     doubt,
-    hand_damping,
     predict_bank,
     reset_bank,
     set_bank,
@@ -18,6 +16,7 @@ from canwall.walls.bank import (
     stiffest,
     with_probe,
 )
+from canwall.walls.bank_gains import SHORTEST_DELAY, hand_damping
 from canwall.walls.estimator import (
     ESTIMATOR,
     MAX_DELAY,

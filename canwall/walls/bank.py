@@ -1,7 +1,8 @@
 """Operator and delay identified in the cycle: a bank of steady-state Kalman filters over the mass.
 
 State and model in force are interpolated between the two filters next to the mass that a regression
-finds (`regression`), at the delay that it finds. Coulomb friction is left to the bias force d̂
+finds (`regression`), at the delay that it finds. How quick the filters are is made beforehand
+(`bank_gains`). Coulomb friction is left to the bias force d̂
 (theory, section 8).
 
 The bank works on an estimator in its steady state and hands over state and model to it. In a gap
@@ -15,14 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
-from canwall.physics import zoh
-from canwall.walls.estimator import (
-    MAX_DELAY,
-    KalmanModel,
-    kalman_model,
-    set_model,
-    set_model_delay,
-)
+from canwall.walls.bank_gains import PACES, QUICKER, SHORTEST_DELAY, STEADIEST, set_filters
+from canwall.walls.estimator import MAX_DELAY, set_model, set_model_delay
 from canwall.walls.regression import (
     REGRESSION,
     begin_regression,
@@ -39,9 +34,6 @@ from canwall.walls.shaft import ElasticShaft
 
 #: Largest number of filters.
 MAX_FILTERS = 24
-
-#: Stiffnesses for which filters have gains, and after these, of a handle that moves.
-_PACES = 8
 
 #: A bank, in the order of the masses. Gains, covariances and transitions are made beforehand:
 #: nothing of a Riccati equation is left for the cycle.
@@ -61,7 +53,7 @@ BANK = np.dtype(
         # as the one before, and for a handle that moves, as parabolas over the bandwidth relative
         # to that for the delay as told; stiffness of the first, number of the one in force, and
         # that relative bandwidth.
-        ("paces", "f8", (3, _PACES + 1, 6, MAX_FILTERS)),
+        ("paces", "f8", (len(QUICKER), PACES + 1, 6, MAX_FILTERS)),
         ("steadiest", "f8"),
         ("pace", "i8"),
         ("quicker", "f8"),
@@ -113,51 +105,20 @@ BANK = np.dtype(
 _FORGOTTEN_S = 0.2
 #: Share of the way to the likeliest mass that is gone in a period.
 _FOLLOWED = 0.6
-#: Mass over the lightest one up to which all filters have one bandwidth, and the power of the mass
-#: with which that of heavier ones falls. What the steps of the encoder make felt at the handle
-#: grows with mass and bandwidth; but under a filter that is slow against the wall a handle that
-#: breaks loose slips far, and friction and the bias force hunt.
-_AS_QUICK, _STEADINESS = 3.0, 0.52
-#: K·T²/m from which on a filter is at its steadiest, and the power of the stiffness with which its
-#: bandwidth rises below, up to the lightest one's, and for walls softer by a factor no further: on
-#: a soft wall noise is felt less, and a filter slower than the wall makes a heavy hand bounce.
-_STEADIEST, _QUICKENING, _SOFTEST = 1.0, 1.0 / 6.0, 16.0
-#: Bandwidth of the lightest filter for a handle at rest, as a part of that for one in motion, and
-#: mass over the lightest one from which on both are the same. Friction adds damping, the more the
-#: smaller the motion: a loop that some damping makes unstable goes on swinging in friction, as that
-#: of a quick filter does with a mass that has little damping of its own.
-_CALM, _CALM_UP_TO = 0.75, 1.25
-#: Bandwidths relative to that for the delay as told, for which filters have gains, and the change
-#: that is worth others.
-_QUICKER, _WORTH = (0.75, 1.0, 1.4), 0.015
-#: Shortest delay that makes filters quicker [periods].
-SHORTEST_DELAY = 0.5
 #: Least way of a handle that moves [counts a sample], and the time after it for which all filters
 #: are as quick as the lightest [s]: noise is felt at rest alone, and a filter that is slow to find
 #: the push after a blow makes a heavy hand bounce.
 _MOVES, _LIVELY_S = 6.0, 0.2
+#: Most equal samples from which on a velocity is bounded by them: a filter that is slower than that
+#: finds rest by itself.
+_EQUAL_SAMPLES = 32.0
+#: Relative change of the bandwidth that is worth other gains.
+_WORTH = 0.015
 #: Deviation of ln(mass) below which the mass counts as known.
 _KNOWN_SPREAD = 0.2
 #: Growth in a period of ln(mass) once it was known and no longer is: a hand that lets go within
 #: milliseconds looks heavy at first, and the wall would throw the handle back.
 _GROWTH_IN_DOUBT = 0.1
-#: Share of half a count within which a reading does not contradict the prediction of a heavy hand,
-#: whose motion between two samples is known better than that. A light one needs each correction.
-_WITHIN = 0.8
-#: Time constants of a filter for which samples have to be equal before its velocity is bounded by
-#: them, and the most samples: a filter that is slower than that finds rest by itself. (Bounded by
-#: anything but the covariance that belongs to its gain, a filter of a handle at rest diverges.)
-_EQUAL, _EQUAL_SAMPLES = 8.0, 32.0
-#: Time constant at which a light hand's damping equals its inertia [s].
-_HAND_S = 1.5e-3
-
-
-def hand_damping(inertia: float, most: float) -> float:
-    """Return the damping of a hand of this inertia at the handle, which tends to `most`.
-
-    Fingers of a few grams have some newton seconds per metre, a grip and an arm hardly more.
-    """
-    return most * inertia / (inertia + most * _HAND_S)
 
 
 def set_bank(
@@ -199,91 +160,9 @@ def set_bank(
     bank["delay"], bank["told"] = delay, told
     set_regression(bank["regression"][0, 0], float(masses[0]), period, count, told, shaft)
     bank["stiffest"], bank["within"] = np.inf, 0.0
-    bank["steadiest"] = _STEADIEST * masses[-1] / period**2
+    bank["steadiest"] = STEADIEST * masses[-1] / period**2
     bank["viscous"][0, :n] = viscous
-    for i in range(n):
-        plant = float(masses[i]), float(viscous[i]), spring, period
-        walk, heavier, slower = force_walk, float(masses[i] / masses[0]), 1.0
-        if shaft is None:
-            light = min(1.0, _AS_QUICK / heavier)
-            calm = min((heavier - 1.0) / (_CALM_UP_TO - 1.0), 1.0)
-            slower = light**_STEADINESS * (_CALM + (1.0 - _CALM) * calm)
-            walk *= heavier * slower**3  # by the cube of the bandwidth
-            bank["within"][0, i] = 0.5 * _WITHIN * (1.0 - light) * abs(count)
-        _set_filter(bank[0], i, kalman_model(*plant, count, walk))
-        _set_paces(bank[0], i, plant, count, walk, slower, follows_delay=shaft is None)
-        _set_torques(bank[0], i, *plant)
-
-
-def _set_paces(
-    bank: np.void,
-    i: int,
-    plant: tuple[float, float, float, float],
-    count: float,
-    walk: float,
-    slower: float,
-    follows_delay: bool,
-) -> None:
-    """Write the gains of a filter and what rest tells it.
-
-    Its bandwidth goes with that of the delay, and up to being as quick as the lightest.
-    """
-    period = plant[-1]
-    paces = np.zeros((len(_QUICKER), _PACES + 1, 6))
-    for k, quicker in enumerate(_QUICKER if follows_delay else [1.0] * len(_QUICKER)):
-        steady = _gain_and_rest(kalman_model(*plant, count, walk * quicker**3), period)
-        quick = _gain_and_rest(kalman_model(*plant, count, walk * (quicker / slower) ** 3), period)
-        for pace, share in enumerate(_shares(bank, i, slower)):
-            paces[k, pace] = steady * (quick / steady) ** share
-    bank["paces"][:, :, :, i] = _parabolas(np.array(_QUICKER), paces)
-
-
-def _shares(bank: np.void, i: int, slower: float) -> list[float]:
-    """Return the share of the way from a filter's steadiest gains to its quickest, by pace."""
-    if slower == 1.0:
-        return [0.0] * (_PACES + 1)
-    steadiest = math.exp(bank["log_step"] * (i + 1 - bank["count"]))
-    softer = [min(max(steadiest * 2.0**k, 1.0), _SOFTEST) for k in range(_PACES)]
-    shares = [_QUICKENING * math.log(each) / -math.log(slower) for each in softer]
-    return [*(min(share, 1.0) for share in shares), 1.0]
-
-
-def _parabolas(at: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return c with c₀ + c₁·x + c₂·x² through three values, shape (3, ...), each."""
-    return np.tensordot(np.linalg.inv(np.vander(at, increasing=True)), values, 1)
-
-
-def _set_torques(
-    bank: np.void, i: int, mass: float, viscous: float, spring: float, period: float
-) -> None:
-    """Write the transition of a filter, and what torques do before and after the actuation."""
-    phi, _ = zoh(mass, viscous, spring, period)
-    bank["phi"][:, i] = phi.ravel()
-    shares = np.array([0.0, 0.5, 1.0])
-    older, newer = np.zeros((3, 2)), np.zeros((3, 2))
-    for k, share in enumerate(shares.tolist()):
-        _, before = zoh(mass, viscous, spring, share * period)
-        phi_after, newer[k] = zoh(mass, viscous, spring, (1.0 - share) * period)
-        older[k] = phi_after @ before
-    bank["older_by_share"][:, :, i] = _parabolas(shares, older)
-    bank["newer_by_share"][:, :, i] = _parabolas(shares, newer)
-
-
-def _set_filter(bank: np.void, i: int, model: KalmanModel) -> None:
-    bank["steady_gain"][:, i] = model.gain
-    bank["covariance"][i], bank["transition"][i] = model.covariance, model.transition
-    bank["scale"][i], bank["force_noise"][i] = model.scale, model.force_noise
-
-
-def _gain_and_rest(model: KalmanModel, period: float) -> NDArray[np.float64]:
-    """Return the gain of a filter, and what equal samples say by its covariance after a sample.
-
-    Those are corrections of position and force for one of the velocity, and the number of samples.
-    """
-    scale, prior = model.scale, model.covariance
-    after = prior - np.outer(model.gain / scale * scale[0], prior[0])
-    with_velocity = after[[0, 2], 1] / after[1, 1] * scale[[0, 2]] / scale[1]
-    return np.array([*model.gain, *with_velocity, _EQUAL * scale[0] / (scale[1] * period)])
+    set_filters(bank[0], masses, spring, period, count, force_walk, rigid=shaft is None)
 
 
 def reset_bank(bank: NDArray[np.void], y: float) -> None:
@@ -344,15 +223,15 @@ def set_pace(bank: Record, stiffness: float) -> None:
         bank.lively_left = bank.lively
     elif bank.lively_left > 0:
         bank.lively_left -= 1
-    pace = _PACES - 1
+    pace = PACES - 1
     if bank.lively_left > 0:
-        pace = _PACES
+        pace = PACES
     elif stiffness > 0.0:
         pace = min(max(int(math.log2(bank.steadiest / stiffness)), 0), pace)
     quicker = bank.quicker
     if bank.delay_in_force >= 0.0:
         quicker = max(bank.delay, SHORTEST_DELAY) / max(bank.delay_in_force, SHORTEST_DELAY)
-        quicker = min(max(quicker, _QUICKER[0]), _QUICKER[2])
+        quicker = min(max(quicker, QUICKER[0]), QUICKER[2])
     if pace == bank.pace and abs(quicker - bank.quicker) < _WORTH:
         return
     bank.pace, bank.quicker = pace, quicker
@@ -490,8 +369,12 @@ def stiffest(bank: Record) -> float:
 
 @compiled
 def doubt(bank: Record) -> float:
-    """Return the doubt about the mass in force, from 0 to 1: the deviation of ln(mass)."""
-    if bank.holds:
+    """Return the doubt about the mass in force, from 0 to 1: the deviation of ln(mass).
+
+    On an elastic shaft there is none: more damping than its bound reckons with would drive the
+    resonance.
+    """
+    if bank.holds or bank.regression[0].rotor > 0.0:
         return 0.0
     return min(bank.spread, 1.0) if bank.spread > 0.0 else 1.0
 

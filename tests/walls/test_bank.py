@@ -262,7 +262,7 @@ def test_no_friction_keeps_up_a_swing(delay: float) -> None:
     bank["regression"]["way"] = 10.0 * COUNT
     set_pace(bank[0], 0.8 * MASSES[0] / PERIOD**2)
     lively = bank["gain"][0, :, 0].copy()
-    dampings = [0.0, *np.geomspace(1e-3, 10.0, 40)]
+    dampings = [0.0, *np.geomspace(0.01, 3.0, 12)]
     for found in (told - 0.1, told, told + 0.1):
         assert max(largest_pole(calm, delay, found, b) for b in dampings) < 0.98
     # As quick as in motion it would swing with some friction, and is stable without any.

@@ -1,0 +1,158 @@
+"""How quick the filters of a bank are: their gains and models, made outside the cycle.
+
+A filter has a bandwidth for walls of each stiffness and one for a handle that moves; it goes with
+that of the delay. What the steps of the encoder make felt grows with mass and bandwidth; a filter
+that is too slow for wall and hand makes them bounce, and one that is too quick for friction swings.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canwall.physics import zoh
+from canwall.walls.estimator import KalmanModel, kalman_model
+
+#: Stiffnesses for which filters have gains, each half of the one before; after these, gains for a
+#: handle that moves.
+PACES = 8
+#: Bandwidths relative to that for the delay as told, for which filters have gains.
+QUICKER = (0.75, 1.0, 1.4)
+#: Shortest delay that makes filters quicker [periods].
+SHORTEST_DELAY = 0.5
+#: Mass over the lightest one up to which all filters have one bandwidth, and the power of the mass
+#: with which that of heavier ones falls. What the steps of the encoder make felt at the handle
+#: grows with mass and bandwidth; but under a filter that is slow against the wall a handle that
+#: breaks loose slips far, and friction and the bias force hunt.
+_AS_QUICK, _STEADINESS = 3.0, 0.52
+#: K·T²/m from which on a filter is at its steadiest, and the power of the stiffness with which its
+#: bandwidth rises below, up to the lightest one's, and for walls softer by a factor no further: on
+#: a soft wall noise is felt less, and a filter slower than the wall makes a heavy hand bounce.
+STEADIEST, _QUICKENING, _SOFTEST = 1.0, 1.0 / 6.0, 16.0
+#: Bandwidth of the lightest filter for a handle at rest, as a part of that for one in motion, and
+#: mass over the lightest one from which on both are the same. Friction adds damping, the more the
+#: smaller the motion: a loop that some damping makes unstable goes on swinging in friction, as that
+#: of a quick filter does with a mass that has little damping of its own.
+_CALM, _CALM_UP_TO = 0.75, 1.25
+#: Share of half a count within which a reading does not contradict the prediction of a heavy hand,
+#: whose motion between two samples is known better than that. A light one needs each correction.
+_WITHIN = 0.8
+#: Time constants of a filter for which samples have to be equal before its velocity is bounded by
+#: them. (Bounded by anything but the covariance that belongs to its gain, a filter of a handle at
+#: rest diverges.)
+_EQUAL = 8.0
+#: Time constant at which a light hand's damping equals its inertia [s].
+_HAND_S = 1.5e-3
+
+
+def hand_damping(inertia: float, most: float) -> float:
+    """Return the damping of a hand of this inertia at the handle, which tends to `most`.
+
+    Fingers of a few grams have some newton seconds per metre, a grip and an arm hardly more.
+    """
+    return most * inertia / (inertia + most * _HAND_S)
+
+
+def set_filters(
+    bank: np.void,
+    masses: NDArray[np.float64],
+    spring: float,
+    period: float,
+    count: float,
+    force_walk: float,
+    rigid: bool,
+) -> None:
+    """Write the filters of a bank whose masses, dampings and delay are set.
+
+    Args:
+        bank: A record BANK.
+        masses: Masses of the filters, shape (n,).
+        spring: Spring of all.
+        period: T [s].
+        count: One count of the encoder [rad].
+        force_walk: As for `set_bank`.
+        rigid: False on an elastic shaft: one walk for all, whatever wall and delay are.
+    """
+    for i in range(len(masses)):
+        plant = float(masses[i]), bank["viscous"][i].item(), spring, period
+        walk, heavier, slower = force_walk, float(masses[i] / masses[0]), 1.0
+        if rigid:
+            light = min(1.0, _AS_QUICK / heavier)
+            calm = min((heavier - 1.0) / (_CALM_UP_TO - 1.0), 1.0)
+            slower = light**_STEADINESS * (_CALM + (1.0 - _CALM) * calm)
+            walk *= heavier * slower**3  # by the cube of the bandwidth
+            bank["within"][i] = 0.5 * _WITHIN * (1.0 - light) * abs(count)
+        _set_filter(bank, i, kalman_model(*plant, count, walk))
+        _set_paces(bank, i, plant, count, walk, slower, rigid)
+        _set_torques(bank, i, *plant)
+
+
+def _set_paces(
+    bank: np.void,
+    i: int,
+    plant: tuple[float, float, float, float],
+    count: float,
+    walk: float,
+    slower: float,
+    rigid: bool,
+) -> None:
+    """Write the gains of a filter and what rest tells it.
+
+    Its bandwidth goes with that of the delay, and up to being as quick as the lightest.
+    """
+    period = plant[-1]
+    paces = np.zeros((len(QUICKER), PACES + 1, 6))
+    for k, quicker in enumerate(QUICKER if rigid else [1.0] * len(QUICKER)):
+        steady = _gain_and_rest(kalman_model(*plant, count, walk * quicker**3), period)
+        quick = _gain_and_rest(kalman_model(*plant, count, walk * (quicker / slower) ** 3), period)
+        for pace, share in enumerate(_shares(bank, i, slower)):
+            paces[k, pace] = steady * (quick / steady) ** share
+    bank["paces"][:, :, :, i] = _parabolas(np.array(QUICKER), paces)
+
+
+def _shares(bank: np.void, i: int, slower: float) -> list[float]:
+    """Return the share of the way from a filter's steadiest gains to its quickest, by pace."""
+    if slower == 1.0:
+        return [0.0] * (PACES + 1)
+    steadiest = math.exp(bank["log_step"] * (i + 1 - bank["count"]))
+    softer = [min(max(steadiest * 2.0**k, 1.0), _SOFTEST) for k in range(PACES)]
+    shares = [_QUICKENING * math.log(each) / -math.log(slower) for each in softer]
+    return [*(min(share, 1.0) for share in shares), 1.0]
+
+
+def _parabolas(at: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return c with c₀ + c₁·x + c₂·x² through three values, shape (3, ...), each."""
+    return np.tensordot(np.linalg.inv(np.vander(at, increasing=True)), values, 1)
+
+
+def _set_torques(
+    bank: np.void, i: int, mass: float, viscous: float, spring: float, period: float
+) -> None:
+    """Write the transition of a filter, and what torques do before and after the actuation."""
+    phi, _ = zoh(mass, viscous, spring, period)
+    bank["phi"][:, i] = phi.ravel()
+    shares = np.array([0.0, 0.5, 1.0])
+    older, newer = np.zeros((3, 2)), np.zeros((3, 2))
+    for k, share in enumerate(shares.tolist()):
+        _, before = zoh(mass, viscous, spring, share * period)
+        phi_after, newer[k] = zoh(mass, viscous, spring, (1.0 - share) * period)
+        older[k] = phi_after @ before
+    bank["older_by_share"][:, :, i] = _parabolas(shares, older)
+    bank["newer_by_share"][:, :, i] = _parabolas(shares, newer)
+
+
+def _set_filter(bank: np.void, i: int, model: KalmanModel) -> None:
+    bank["steady_gain"][:, i] = model.gain
+    bank["covariance"][i], bank["transition"][i] = model.covariance, model.transition
+    bank["scale"][i], bank["force_noise"][i] = model.scale, model.force_noise
+
+
+def _gain_and_rest(model: KalmanModel, period: float) -> NDArray[np.float64]:
+    """Return the gain of a filter, and what equal samples say by its covariance after a sample.
+
+    Those are corrections of position and force for one of the velocity, and the number of samples.
+    """
+    scale, prior = model.scale, model.covariance
+    after = prior - np.outer(model.gain / scale * scale[0], prior[0])
+    with_velocity = after[[0, 2], 1] / after[1, 1] * scale[[0, 2]] / scale[1]
+    return np.array([*model.gain, *with_velocity, _EQUAL * scale[0] / (scale[1] * period)])
