@@ -34,11 +34,11 @@ from canwall.walls import (
     probe_acts,
     put_in_force,
     set_applied_force,
-    set_model,
     set_pace,
     stand_still,
     start_lagging,
     stiffest,
+    take_over,
     wall_force,
     with_probe,
 )
@@ -134,8 +134,8 @@ def _identify_operator(cycle: Record, sample: float) -> None:
         if cycle.fade_left > 0:
             change_plant(cycle.faded[0].wall[0], estimator.mass, estimator.viscous)
         if cycle.compares_lag:
-            set_model(cycle.lagging[0], estimator.mass, estimator.viscous, bank.spring)
-            set_model(cycle.losing[0], estimator.mass, estimator.viscous, bank.spring)
+            take_over(bank, cycle.lagging[0])
+            take_over(bank, cycle.losing[0])
     cycle.rendered[0].wall[0].doubt = doubt(bank)
 
 

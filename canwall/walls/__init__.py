@@ -14,6 +14,7 @@ from canwall.walls.bank import (
     set_bank,
     set_pace,
     stiffest,
+    take_over,
     with_probe,
 )
 from canwall.walls.bank_gains import SHORTEST_DELAY, hand_damping
@@ -115,6 +116,7 @@ __all__ = [
     "start_open_loop",
     "stiffest",
     "stiffest_wall",
+    "take_over",
     "wall_force",
     "with_probe",
 ]

@@ -209,9 +209,7 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
     estimator.v = state[1, k] + share * (state[1, k + 1] - state[1, k])
     estimator.d = state[2, k] + share * (state[2, k + 1] - state[2, k])
     if changed:
-        viscous = bank.viscous[k] + share * (bank.viscous[k + 1] - bank.viscous[k])
-        set_model(estimator, bank.mass, viscous, bank.spring)
-        _set_covariance(bank, estimator, int(bank.place + 0.5))
+        take_over(bank, estimator)
     return changed
 
 
@@ -380,14 +378,29 @@ def doubt(bank: Record) -> float:
 
 
 @compiled
-def _set_covariance(bank: Record, estimator: Record, i: int) -> None:
-    """Give the estimator the gain and the covariance of filter i, for a gap of samples."""
+def take_over(bank: Record, estimator: Record) -> None:
+    """Give an estimator the mass in force, with the gain and the covariance that belong to it.
+
+    With those of another mass it may diverge.
+    """
+    k = min(int(bank.place), bank.count - 2)
+    share = bank.place - k
+    viscous = bank.viscous[k] + share * (bank.viscous[k + 1] - bank.viscous[k])
+    set_model(estimator, bank.mass, viscous, bank.spring)
+    i = int(bank.place + 0.5)
+    if not estimator.settled:
+        for row in range(3):
+            for c in range(3):
+                before = estimator.scale[row] * estimator.scale[c]
+                estimator.covariance[row, c] *= before / (bank.scale[i, row] * bank.scale[i, c])
     estimator.steady_covariance[:] = bank.covariance[i]
     estimator.transition[:] = bank.transition[i]
     estimator.scale[:] = bank.scale[i]
     estimator.force_noise = bank.force_noise[i]
     for c in range(3):
-        estimator.steady_gain[c] = estimator.gain[c] = bank.steady_gain[c, i]
+        estimator.steady_gain[c] = bank.steady_gain[c, i]
+        if estimator.settled:
+            estimator.gain[c] = bank.steady_gain[c, i]
 
 
 @compiled

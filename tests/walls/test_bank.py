@@ -27,8 +27,10 @@ from canwall.walls import (
     reset_estimator,
     set_bank,
     set_estimator,
+    set_model,
     set_pace,
     start_lagging,
+    take_over,
 )
 
 PERIOD, COUNT, WALK, DELAY = 1e-3, 4.8e-5, 0.02, 1.35
@@ -245,6 +247,32 @@ def largest_pole(gain: NDArray[np.float64], delay: float, found: float, damping:
     over_period[5], over_period[6] = force, x[5]
     poles = np.linalg.eigvals(over_period)
     return float(np.abs(poles[np.abs(np.angle(poles)) > 0.1]).max())
+
+
+@pytest.mark.parametrize("settled", [True, False])
+def test_estimator_beside_the_bank_takes_over_gain_and_mass(settled: bool) -> None:
+    """With the gain of a heavy hand and the mass of a light one it diverges at rest."""
+    bank, estimator = bank_at(0.0)
+
+    def left_alone(takes_over: bool) -> float:
+        beside = estimator.copy()
+        bank["place"], bank["mass"] = 15.0, MASSES[15]
+        take_over(bank[0], beside[0])
+        if not settled:
+            note_missing_sample(beside[0])
+            predict(beside[0], 0.0)
+        bank["place"], bank["mass"] = 0.0, MASSES[0]
+        if takes_over:
+            take_over(bank[0], beside[0])
+        else:
+            set_model(beside[0], MASSES[0], VISCOUS[0], 0.0)
+        for j in range(300):
+            correct(beside[0], COUNT * (j % 7 == 0))
+            predict(beside[0], 0.0)
+        return abs(float(beside["v"][0]))
+
+    assert left_alone(True) < 0.1
+    assert not left_alone(False) < 1e3
 
 
 @pytest.mark.parametrize("delay", [1.35, 1.6])
