@@ -1,9 +1,8 @@
 """Operator and delay identified in the cycle: a bank of steady-state Kalman filters over the mass.
 
 State and model in force are interpolated between the two filters next to the mass that a regression
-finds (`regression`), at the delay that it finds. How quick the filters are is made beforehand
-(`bank_gains`). Coulomb friction is left to the bias force d̂
-(theory, section 8).
+finds (`regression`), at the delay that it finds. The gains of the filters are made beforehand
+(`bank_gains`). Coulomb friction is left to the bias force d̂ (theory, section 8).
 
 The bank works on an estimator in its steady state and hands over state and model to it. In a gap
 of samples, and until the estimator has settled again, the estimator goes on alone and the bank

@@ -1,4 +1,4 @@
-"""How quick the filters of a bank are: their gains and models, made outside the cycle.
+"""Bandwidths of the filters of a bank: their gains and models, made outside the cycle.
 
 A filter has a bandwidth for walls of each stiffness and one for a handle that moves; it goes with
 that of the delay. What the steps of the encoder make felt grows with mass and bandwidth; a filter
@@ -102,11 +102,11 @@ def _set_paces(
     """
     period = plant[-1]
     paces = np.zeros((len(QUICKER), PACES + 1, 6))
+    shares = np.array(_shares(bank, i, slower))[:, None]
     for k, quicker in enumerate(QUICKER if rigid else [1.0] * len(QUICKER)):
         steady = _gain_and_rest(kalman_model(*plant, count, walk * quicker**3), period)
         quick = _gain_and_rest(kalman_model(*plant, count, walk * (quicker / slower) ** 3), period)
-        for pace, share in enumerate(_shares(bank, i, slower)):
-            paces[k, pace] = steady * (quick / steady) ** share
+        paces[k] = steady * (quick / steady) ** shares
     bank["paces"][:, :, :, i] = _parabolas(np.array(QUICKER), paces)
 
 

@@ -222,8 +222,7 @@ def largest_pole(gain: NDArray[np.float64], delay: float, found: float, damping:
     wall[1, :2] = -stiffness / mass, -damped / mass
     over, within = expm(free * PERIOD), expm(wall * PERIOD)
     law = (within[1] - over[1]) / over[1, 2]
-    real = free[:2].copy()
-    real[1, 1] = -(viscous + damping) / mass
+    real = np.array([[0.0, 1.0, 0.0], [0.0, -(viscous + damping) / mass, 0.0]])
     # The state: [y, ẏ] of the handle, [y, ẏ, d] of the filter, the last two forces.
     size = 7
     x = np.eye(size)
@@ -241,7 +240,6 @@ def largest_pole(gain: NDArray[np.float64], delay: float, found: float, damping:
     at_actuation = held(free, found - 1.0, known, x[6])
     force = law @ held(free, 1.0, at_actuation, x[5])
     over_period = np.zeros((size, size))
-    real = np.column_stack([real[:, :2], np.zeros(2)])
     over_period[:2] = held(real, 2.0 - delay, held(real, delay - 1.0, x[:2], x[6]), x[5])
     over_period[2:5] = held(free, 2.0 - found, at_actuation, x[5])
     over_period[5], over_period[6] = force, x[5]
