@@ -165,8 +165,8 @@ def measure_strike(
     into.penetration = max(-y.min(), 0.0) if len(y) else 0.0
     into.first_depth = first_depth(y)
     into.referent_first_depth = first_depth(referent)
-    speed, into.restitution = first_bounce(y, period)
-    _, into.referent_restitution = first_bounce(referent, period)
+    speed, into.restitution = first_bounce(y, period, count)
+    _, into.referent_restitution = first_bounce(referent, period, count)
     into.rate_hardness = math.nan
     if speed < 0.0 and first + SPAN < len(force):
         into.rate_hardness = -(force[first + SPAN] - force[first]) / (SPAN * period) / speed
@@ -241,12 +241,14 @@ def first_depth(y: Array) -> float:
 
 
 @compiled
-def first_bounce(y: Array, period: float) -> tuple[float, float]:
+def first_bounce(y: Array, period: float, count: float) -> tuple[float, float]:
     """Return the speed into the first contact and the restitution; NaN if there is none.
 
     Speeds are means over SPAN samples. That of the approach is the fastest of those which end
     within the last SPAN samples before the contact, since a wall may act ahead of its surface; that
-    on leaving is over the first samples outside.
+    on leaving is over the first samples outside. Where a wall has stopped the handle before its
+    surface, it creeps in: below a count a sample its speed says nothing, and the restitution is the
+    speed on leaving over a count a sample.
     """
     enter = 0
     while enter < len(y) and y[enter] >= 0.0:
@@ -264,4 +266,5 @@ def first_bounce(y: Array, period: float) -> tuple[float, float]:
     for j in range(leave, leave + SPAN):
         if y[j] < 0.0:
             return speed, math.nan
-    return speed, -(y[leave + SPAN] - y[leave]) / (SPAN * period) / speed
+    out = (y[leave + SPAN] - y[leave]) / (SPAN * period)
+    return speed, out / max(-speed, count / period)

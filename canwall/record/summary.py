@@ -137,7 +137,7 @@ def _strike(
         "referent_first_depth_rad": _known(
             math.nan if referent is None else first_depth(referent[cycles])
         ),
-        "restitution": _known(first_bounce(y[around], period)[1]),
+        "restitution": _known(first_bounce(y[around], period, units.rad_per_count)[1]),
         "peak_force_nm": float(force[cycles].max(initial=0.0)),
         "energy_out_j": float(running[-1]),
         "energy_out_max_j": float(running.max()),

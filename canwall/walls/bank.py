@@ -115,9 +115,13 @@ _EQUAL_SAMPLES = 32.0
 _WORTH = 0.015
 #: Deviation of ln(mass) below which the mass counts as known.
 _KNOWN_SPREAD = 0.2
-#: Growth in a period of ln(mass) once it was known and no longer is: a hand that lets go within
-#: milliseconds looks heavy at first, and the wall would throw the handle back.
+#: Growth in a period of ln(mass) once it was known and no longer is, while the torque rises: a hand
+#: that lets go within milliseconds looks heavy, since the torque falls and nothing moves for it, and
+#: the wall would throw the handle.
 _GROWTH_IN_DOUBT = 0.1
+#: Mass over the lightest one from which on doubt about the delay counts in full. A light hand would
+#: swing under the damping.
+_DELAY_COUNTS = 10.0
 
 
 def set_bank(
@@ -299,7 +303,7 @@ def _identify(bank: Record, estimator: Record, y_sample: float) -> bool:
     learned = learn(bank.regression[0], estimator, y_sample, bank.mass)
     if _torque_acted(estimator):
         bank.at_rest = 0
-        return learned and not bank.holds and _follow(bank)
+        return learned and not bank.holds and _follow(bank, _torque_falls(estimator))
     bank.at_rest += 1
     if bank.at_rest != bank.forgotten:
         return False
@@ -316,7 +320,13 @@ def _torque_acted(estimator: Record) -> bool:
 
 
 @compiled
-def _follow(bank: Record) -> bool:
+def _torque_falls(estimator: Record) -> bool:
+    n = min(estimator.delay_periods, MAX_DELAY - 1)
+    return abs(estimator.in_flight[n]) < abs(estimator.in_flight[n + 1])
+
+
+@compiled
+def _follow(bank: Record, torque_falls: bool) -> bool:
     """Move the mass in force towards the likeliest one; return True if it moved."""
     likeliest, deviation = solve(bank.regression[0], bank.mass)
     bank.spread = deviation / max(likeliest, deviation)
@@ -327,7 +337,7 @@ def _follow(bank: Record) -> bool:
     if bank.spread < _KNOWN_SPREAD:
         bank.known = True
     elif bank.known:
-        step = min(step, _GROWTH_IN_DOUBT / bank.log_step)
+        step = min(step, 0.0 if torque_falls else _GROWTH_IN_DOUBT / bank.log_step)
     bank.place += step
     bank.mass = _mass_at(bank, bank.place)
     return step != 0.0
@@ -366,14 +376,22 @@ def stiffest(bank: Record) -> float:
 
 @compiled
 def doubt(bank: Record) -> float:
-    """Return the doubt about the mass in force, from 0 to 1: the deviation of ln(mass).
+    """Return the doubt about the mass in force and, in motion, about the delay, from 0 to 1.
 
+    That of the mass is the deviation of its logarithm, that of the delay its deviation in periods.
     On an elastic shaft there is none: more damping than its bound reckons with would drive the
     resonance.
     """
-    if bank.holds or bank.regression[0].rotor > 0.0:
+    regression = bank.regression[0]
+    if bank.holds or regression.rotor > 0.0:
         return 0.0
-    return min(bank.spread, 1.0) if bank.spread > 0.0 else 1.0
+    if bank.spread == 0.0:
+        return 1.0
+    of_delay = 0.0
+    if bank.lively_left > 0:
+        heavy = min(bank.place * bank.log_step / math.log(_DELAY_COUNTS), 1.0)
+        of_delay = heavy * regression.excess_spread
+    return min(bank.spread + of_delay, 1.0)
 
 
 @compiled

@@ -63,7 +63,7 @@ WALL = np.dtype(
         ("asked_stiffness", "f8"),
         ("asked_damping", "f8"),
         ("damping_ratio", "f8"),
-        # By how much larger ζ is in force, relatively, as long as the mass is in doubt.
+        # By how much larger ζ is in force, relatively, as long as mass or delay are in doubt.
         ("doubt", "f8"),
         ("cap", "f8"),
         # Where there is a cap: the largest stiffness on an elastic shaft with the mass in force.

@@ -18,7 +18,7 @@ def test_only_the_first_contact_counts() -> None:
 def test_restitution_is_speed_out_over_speed_in(restitution: float) -> None:
     steps = np.arange(20.0)
     y = np.concatenate([(20.0 - steps) * 1e-3, [-1e-3, -1e-3], steps * restitution * 1e-3])
-    speed, found = first_bounce(y, 1e-3)
+    speed, found = first_bounce(y, 1e-3, 1e-4)
     assert speed == pytest.approx(-1.0)
     assert found == pytest.approx(restitution)
 
@@ -26,9 +26,17 @@ def test_restitution_is_speed_out_over_speed_in(restitution: float) -> None:
 def test_speed_of_approach_is_that_before_a_wall_acts_ahead_of_its_surface() -> None:
     y = np.array([9.0, 8.0, 7.0, 6.0, 5.0, 4.0, 3.0, 2.4, 2.1, 2.0]) * 1e-3
     y = np.concatenate([y, [-1e-3, -1e-3], np.arange(20.0) * 0.5e-3])
-    speed, found = first_bounce(y, 1e-3)
+    speed, found = first_bounce(y, 1e-3, 1e-4)
     assert speed == pytest.approx(-1.0)
     assert found == pytest.approx(0.5)
+
+
+def test_speed_of_a_handle_that_creeps_in_is_a_count_a_sample() -> None:
+    y = np.array([9.0, 4.0, *np.ones(12), 0.0, -1.0, -1.0])
+    for out in (0.4, 2.0):
+        speed, found = first_bounce(np.concatenate([y, out * np.arange(20.0)]), 1.0, 1.0)
+        assert speed == pytest.approx(-0.2)
+        assert found == pytest.approx(out)
 
 
 def test_a_wall_is_known_best_before_the_hand_leaves_it() -> None:

@@ -136,6 +136,19 @@ def test_mass_that_was_known_grows_slowly_in_doubt(known: bool) -> None:
     assert masses[-1] == pytest.approx(2.5e-3, rel=0.2)
 
 
+@pytest.mark.parametrize("known", [False, True])
+def test_mass_in_doubt_does_not_grow_while_the_torque_falls(known: bool) -> None:
+    """A wall that gives way to a hand that withdraws moves nothing: it looks heavy."""
+    bank, estimator = bank_at(0.0)
+    play(bank, estimator, 2.5e-4, pulses(0.3))
+    bank["known"] = known
+    bank["regression"]["information"] = 0.0
+    torques = np.zeros(120)
+    torques[60:90] = np.linspace(0.75, 0.0, 30)
+    masses = play(bank, estimator, 2.5e-3, torques)
+    assert np.any(np.diff(np.log(masses[64:90])) > 0.0) != known
+
+
 def test_doubt_is_the_deviation_of_the_mass() -> None:
     bank, estimator = bank_at(0.0)
     assert doubt(bank[0]) == 1.0
@@ -145,6 +158,18 @@ def test_doubt_is_the_deviation_of_the_mass() -> None:
     assert doubt(bank[0]) == 1.0
     bank["holds"] = True
     assert doubt(bank[0]) == 0.0
+
+
+@pytest.mark.parametrize(("mass", "share"), [(1e-4, 0.0), (10**-3.5, 0.5), (1e-3, 1.0), (3e-3, 1.0)])
+def test_delay_in_doubt_counts_for_a_heavy_hand_that_moves(mass: float, share: float) -> None:
+    bank, _ = bank_at(0.0)
+    bank["place"] = np.interp(np.log(mass), np.log(MASSES), np.arange(len(MASSES)))
+    bank["spread"], bank["regression"]["excess_spread"] = 0.1, 0.2
+    assert doubt(bank[0]) == 0.1
+    bank["lively_left"] = 1
+    assert doubt(bank[0]) == pytest.approx(0.1 + share * 0.2)
+    bank["spread"] = 0.9
+    assert doubt(bank[0]) == pytest.approx(min(0.9 + share * 0.2, 1.0))
 
 
 def walk_of(i: int, quicker: float = 1.0) -> float:
