@@ -19,7 +19,6 @@ from canwall.walls import (
     ESTIMATOR,
     LATCH,
     MAX_DELAY,
-    SHORTEST_DELAY,
     TENSION,
     WALL,
     ElasticShaft,
@@ -29,6 +28,7 @@ from canwall.walls import (
     find_law,
     force_walk_of,
     hand_damping,
+    lightest_bandwidth,
     reset_bank,
     reset_estimator,
     reset_latch,
@@ -53,8 +53,6 @@ SYNCHRONOUS_DELAY = 1.0
 _FORCE_WALK = 0.2
 #: Largest bandwidth of a filter on an elastic shaft, as a part of the resonance.
 _FILTER_PART = 0.125
-#: Bandwidth of the filter of the lightest hand, over that of one which follows within the delay.
-_QUICKNESS = 0.85
 #: What the model has more than the delay that is told where the hand is unknown [periods].
 _DELAY_MARGIN = 0.1
 #: Missed motion below this is ignored, since a coarse encoder stays on one count for long [counts].
@@ -272,7 +270,7 @@ def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None
     if settings.operator.adapt:
         masses, dampings = _hands(settings)
         mass, viscous, coulomb = masses[0], dampings[0], 0.0
-        bandwidth = min(bandwidth, _QUICKNESS / (max(delay, SHORTEST_DELAY) * period))
+        bandwidth = min(bandwidth, lightest_bandwidth(delay, period))
     if force_walk is None:
         force_walk = _FORCE_WALK
         if bandwidth < math.inf:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
+from scipy.stats import qmc
 
 from canwall.config import Settings
 from canwall.cycle import named_law
@@ -37,9 +38,12 @@ _FRICTION = 0.01
 #: against the SYNC, and time of the press [s], in which slow estimates of force settle as well.
 _SPEEDS, _PHASES = (0.3, 0.8, 2.0), (0.0, 0.35, 0.7)
 _PRESS_S = 1.2
-#: With the cap: c, and the walls that are asked for [N·m/rad].
+#: With the cap: c, and the strikes that are drawn, each for all conditions: their number, and the
+#: ranges of the wall that is asked for [N·m/rad] and of the mean speed [rad/s]. Walls above the cap
+#: are one wall: strikes that differ in nothing else fail together, and tell little.
 CAPS = (0.5, 0.8, 1.0)
-_ASKED = tuple(np.geomspace(30.0, 5000.0, 12).round(1).tolist())
+DRAWS = 144
+_ASKED, _DRAWN_SPEEDS = (30.0, 5000.0), (0.2, 2.0)
 #: First strikes: the wall [N·m/rad], the speeds of approach [rad/s], and the phases.
 _FIRST_STIFFNESS = 200.0
 _FIRST_SPEEDS = (0.3, 0.5, 0.7, 1.0)
@@ -47,6 +51,7 @@ _FIRST_PHASES = tuple(round(n / 6.0, 3) for n in range(6))
 #: Resonances of the shafts [Hz].
 _SHAFTS = (400.0, 250.0)
 
+_DRAWN = ("stiffness", "speed", "phase")
 _LIMITS = ("worst", "worst_normalised", "open_ended")
 
 
@@ -58,6 +63,8 @@ class LawTable:
         title: Its title.
         laws: Its laws unless others are asked for; empty: that of the configuration.
         axes: Axes besides those of every table, by name.
+        draws: Number of strikes with stiffness, speed and phase drawn at random; 0: those of the
+            axes.
         searches: True if its cells are K-limits.
         capped: True if `wall.cap` stays in force.
         write: Writes the result as Markdown, line by line.
@@ -66,6 +73,7 @@ class LawTable:
     title: str
     laws: tuple[str, ...]
     axes: dict[str, Sequence[float | str]]
+    draws: int
     searches: bool
     capped: bool
     write: Callable[[xr.Dataset], Iterator[str]]
@@ -95,8 +103,9 @@ def compute_law_table(
         progress: Called with the pieces of work done and their total.
 
     Returns:
-        The measures that the table shows, with a dimension per axis. K-limits are at the best of
-        DAMPINGS, which is the coordinate `damping_normalised`.
+        The measures that the table shows, with a dimension per axis, or in place of stiffness,
+        speed and phase the dimension `strike`. K-limits are at the best of DAMPINGS, which is the
+        coordinate `damping_normalised`.
 
     Raises:
         InputError: For a table, a law or an operator that does not exist.
@@ -121,7 +130,11 @@ def compute_law_table(
             progress(done, total)
         dataset = assemble_dataset(plan, pieces)
         found.append(_limits_of(dataset, table) if table.searches else dataset)
-    joined = xr.concat(found, "law", join="outer").sel(law=chosen) if table.searches else found[0]
+    joined = found[0]
+    if table.searches:
+        joined = xr.concat(found, "law", join="outer").sel(law=chosen)
+    elif table.draws:
+        joined = xr.concat([each.squeeze(_DRAWN) for each in found], "strike")
     return joined.assign_attrs(found[0].attrs | {"title": table.title, "table": name})
 
 
@@ -147,6 +160,9 @@ def _make_plans(
     }
     if not table.capped:
         base = base.model_copy(update={"wall": base.wall.model_copy(update={"cap": None})})
+    if table.draws:
+        drawn = drawn_strikes(table.draws)
+        return [make_plan(base, {"law": laws, **shared, **strike}, through) for strike in drawn]
     if not table.searches:
         return [make_plan(base, {"law": laws, **shared}, through)]
     plain = {"damping_ratio": None, "damping_nm_s_per_rad": 0.0}
@@ -167,6 +183,14 @@ def _make_plans(
             axes = {"law": some, "damping_normalised": dampings, **axes}
             plans.append(make_plan(settings, axes, through))
     return plans
+
+
+def drawn_strikes(count: int) -> Iterator[dict[str, float]]:
+    """Yield strikes spread evenly over the ranges, always the same, as the axes _DRAWN."""
+    low, high = np.log(np.transpose([_ASKED, _DRAWN_SPEEDS]))
+    for *of_range, phase in qmc.Halton(3, seed=1).random(count).tolist():
+        stiffness, speed = np.exp(low + (high - low) * of_range).tolist()
+        yield dict(zip(_DRAWN, (stiffness, speed, phase), strict=True))
 
 
 def _limits_of(dataset: xr.Dataset, table: LawTable) -> xr.Dataset:
@@ -342,6 +366,7 @@ LAW_TABLES = {
         "K-limits of the laws in unknown hands",
         _WITH_STIFFNESS,
         _SERVOS_AND_FRICTIONS | {"delay_error": DELAY_ERRORS},
+        0,
         True,
         False,
         _write_laws,
@@ -349,8 +374,8 @@ LAW_TABLES = {
     "cap": LawTable(
         "Walls with a cap in unknown hands",
         (),
-        _SERVOS_AND_FRICTIONS
-        | {"delay_error": DELAY_ERRORS, "wall.cap": CAPS, "stiffness": _ASKED},
+        _SERVOS_AND_FRICTIONS | {"delay_error": DELAY_ERRORS, "wall.cap": CAPS},
+        DRAWS,
         False,
         True,
         _write_cap,
@@ -360,6 +385,7 @@ LAW_TABLES = {
         (),
         _SERVOS_AND_FRICTIONS
         | {"stiffness": (_FIRST_STIFFNESS,), "speed": _FIRST_SPEEDS, "phase": _FIRST_PHASES},
+        0,
         False,
         False,
         _write_first_strikes,
@@ -368,6 +394,7 @@ LAW_TABLES = {
         "K-limits on an elastic shaft",
         ("standard", "damped", "half_sample", "mean_force"),
         {"servo": ("1600Hz",), "friction": (_FRICTION,), "simulation.shaft_hz": _SHAFTS},
+        0,
         True,
         False,
         _write_shafts,

@@ -17,7 +17,7 @@ from canwall.walls.bank import (
     take_over,
     with_probe,
 )
-from canwall.walls.bank_gains import SHORTEST_DELAY, hand_damping
+from canwall.walls.bank_gains import hand_damping, lightest_bandwidth
 from canwall.walls.estimator import (
     ESTIMATOR,
     MAX_DELAY,
@@ -67,7 +67,6 @@ __all__ = [
     "LAWS",
     "MAX_DELAY",
     "MAX_FILTERS",
-    "SHORTEST_DELAY",
     "TENSION",
     "WALL",
     "ElasticShaft",
@@ -92,6 +91,7 @@ __all__ = [
     "hand_damping",
     "is_declared",
     "law",
+    "lightest_bandwidth",
     "likelier",
     "may_lag",
     "note_missing_sample",

@@ -115,9 +115,9 @@ _EQUAL_SAMPLES = 32.0
 _WORTH = 0.015
 #: Deviation of ln(mass) below which the mass counts as known.
 _KNOWN_SPREAD = 0.2
-#: Growth in a period of ln(mass) once it was known and no longer is, while the torque rises: a hand
-#: that lets go within milliseconds looks heavy, since the torque falls and nothing moves for it, and
-#: the wall would throw the handle.
+#: Growth in a period of ln(mass) once it was known and no longer is, unless the torque falls: a
+#: hand that lets go within milliseconds looks heavy, since the wall gives way and nothing moves, and
+#: the handle would be thrown.
 _GROWTH_IN_DOUBT = 0.1
 #: Mass over the lightest one from which on doubt about the delay counts in full. A light hand would
 #: swing under the damping.

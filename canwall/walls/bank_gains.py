@@ -20,6 +20,8 @@ PACES = 8
 QUICKER = (0.75, 1.0, 1.4)
 #: Shortest delay that makes filters quicker [periods].
 SHORTEST_DELAY = 0.5
+#: Bandwidth of the filter of the lightest hand, over that of one which follows within the delay.
+_QUICKNESS = 0.85
 #: Mass over the lightest one up to which all filters have one bandwidth, and the power of the mass
 #: with which that of heavier ones falls. What the steps of the encoder make felt at the handle
 #: grows with mass and bandwidth; but under a filter that is slow against the wall a handle that
@@ -51,6 +53,11 @@ def hand_damping(inertia: float, most: float) -> float:
     Fingers of a few grams have some newton seconds per metre, a grip and an arm hardly more.
     """
     return most * inertia / (inertia + most * _HAND_S)
+
+
+def lightest_bandwidth(delay: float, period: float) -> float:
+    """Return the bandwidth [rad/s] of the filter of the lightest hand; delay in periods."""
+    return _QUICKNESS / (max(delay, SHORTEST_DELAY) * period)
 
 
 def set_filters(

@@ -4,7 +4,9 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scipy import stats
 
 from canwall import cli, config
 from canwall.sweep import LAW_TABLES, law_tables, make_plan, read_sweep, sweep
@@ -38,13 +40,14 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(law_tables, "DAMPINGS", (0.05, 0.4))
     axes = {
         "laws": {"servo": ["1600Hz"], "friction": [0.02], "delay_error": [-0.3, 0.0]},
-        "cap": {"servo": ["800Hz"], "friction": [0.0], "delay_error": [0.0], "stiffness": [4000.0]},
+        "cap": {"servo": ["800Hz"], "friction": [0.0], "delay_error": [0.0]},
         "first-strike": {"servo": ["1600Hz"], "friction": [0.02]},
         "shaft": {"simulation.shaft_hz": [400.0]},
     }
     for name, few in axes.items():
         fewer = LAW_TABLES[name].axes | few | {"speed": [1.0], "phase": [0.35]}
-        monkeypatch.setitem(LAW_TABLES, name, replace(LAW_TABLES[name], axes=fewer))
+        table = LAW_TABLES[name]
+        monkeypatch.setitem(LAW_TABLES, name, replace(table, axes=fewer, draws=min(table.draws, 2)))
 
 
 @pytest.mark.slow
@@ -103,9 +106,18 @@ def test_cap_is_what_is_in_force(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert run("sweep", file, "--table", "cap", "--operator", "grip") == 0
     head, *rows = rows_of(capsys.readouterr().out)
     assert head == ["", "grip"]
-    assert [row[1] for row in rows if "failed" in row[0]] == ["1 of 1"] * len(law_tables.CAPS)
+    assert [row[1] for row in rows if "failed" in row[0]] == ["2 of 2"] * len(law_tables.CAPS)
     least = [float(row[1]) for row in rows if "least" in row[0]]
     assert least == pytest.approx([cap / 4.2 for cap in law_tables.CAPS], rel=5e-3)
+
+
+def test_strikes_with_a_cap_are_spread_over_all_walls_speeds_and_phases() -> None:
+    drawn = list(law_tables.drawn_strikes(law_tables.DRAWS))
+    assert drawn == list(law_tables.drawn_strikes(law_tables.DRAWS))
+    for name, low, high in (("stiffness", 30.0, 5000.0), ("speed", 0.2, 2.0)):
+        place = np.log([strike[name] / low for strike in drawn]) / np.log(high / low)
+        assert stats.kstest(place, "uniform").pvalue > 0.9
+    assert stats.kstest([strike["phase"] for strike in drawn], "uniform").pvalue > 0.9
 
 
 @pytest.mark.slow

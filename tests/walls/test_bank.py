@@ -160,7 +160,7 @@ def test_doubt_is_the_deviation_of_the_mass() -> None:
     assert doubt(bank[0]) == 0.0
 
 
-@pytest.mark.parametrize(("mass", "share"), [(1e-4, 0.0), (10**-3.5, 0.5), (1e-3, 1.0), (3e-3, 1.0)])
+@pytest.mark.parametrize(("mass", "share"), [(1e-4, 0.0), (10**-3.5, 0.5), (1e-3, 1.0), (3e-3, 1)])
 def test_delay_in_doubt_counts_for_a_heavy_hand_that_moves(mass: float, share: float) -> None:
     bank, _ = bank_at(0.0)
     bank["place"] = np.interp(np.log(mass), np.log(MASSES), np.arange(len(MASSES)))
