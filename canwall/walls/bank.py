@@ -28,6 +28,7 @@ from canwall.walls.regression import (
     reset_regression,
     set_regression,
     solve,
+    torque_rises,
 )
 from canwall.walls.shaft import ElasticShaft
 
@@ -115,9 +116,9 @@ _EQUAL_SAMPLES = 32.0
 _WORTH = 0.015
 #: Deviation of ln(mass) below which the mass counts as known.
 _KNOWN_SPREAD = 0.2
-#: Growth in a period of ln(mass) once it was known and no longer is, unless the torque falls: a
-#: hand that lets go within milliseconds looks heavy, since the wall gives way and nothing moves, and
-#: the handle would be thrown.
+#: Growth in a period of ln(mass) once it was known and no longer is, while the torque rises: a hand
+#: that lets go within milliseconds looks heavy, since the wall gives way and nothing moves, and the
+#: handle would be thrown.
 _GROWTH_IN_DOUBT = 0.1
 #: Mass over the lightest one from which on doubt about the delay counts in full. A light hand would
 #: swing under the damping.
@@ -300,14 +301,15 @@ def _bound_velocity(bank: Record, y_sample: float) -> None:
 @compiled
 def _identify(bank: Record, estimator: Record, y_sample: float) -> bool:
     """Follow what a sample tells of the mass; return True if the mass in force changed."""
-    learned = learn(bank.regression[0], estimator, y_sample, bank.mass)
+    regression, calm = bank.regression[0], bank.lively_left == 0
+    learned = learn(regression, estimator, y_sample, bank.mass, calm)
     if _torque_acted(estimator):
         bank.at_rest = 0
-        return learned and not bank.holds and _follow(bank, _torque_falls(estimator))
+        return learned and not bank.holds and _follow(bank, torque_rises(regression, estimator))
     bank.at_rest += 1
     if bank.at_rest != bank.forgotten:
         return False
-    forget_mass(bank.regression[0])
+    forget_mass(regression)
     return not bank.holds and _forget(bank)
 
 
@@ -320,14 +322,11 @@ def _torque_acted(estimator: Record) -> bool:
 
 
 @compiled
-def _torque_falls(estimator: Record) -> bool:
-    n = min(estimator.delay_periods, MAX_DELAY - 1)
-    return abs(estimator.in_flight[n]) < abs(estimator.in_flight[n + 1])
+def _follow(bank: Record, rises: bool) -> bool:
+    """Move the mass in force towards the likeliest one; return True if it moved.
 
-
-@compiled
-def _follow(bank: Record, torque_falls: bool) -> bool:
-    """Move the mass in force towards the likeliest one; return True if it moved."""
+    rises: True if the torque does.
+    """
     likeliest, deviation = solve(bank.regression[0], bank.mass)
     bank.spread = deviation / max(likeliest, deviation)
     if likeliest > 0.0:
@@ -337,7 +336,7 @@ def _follow(bank: Record, torque_falls: bool) -> bool:
     if bank.spread < _KNOWN_SPREAD:
         bank.known = True
     elif bank.known:
-        step = min(step, 0.0 if torque_falls else _GROWTH_IN_DOUBT / bank.log_step)
+        step = min(step, _GROWTH_IN_DOUBT / bank.log_step if rises else 0.0)
     bank.place += step
     bank.mass = _mass_at(bank, bank.place)
     return step != 0.0

@@ -82,12 +82,16 @@ _OBSERVER_HZ, _OBSERVER_BEHIND_SHAFT_HZ = 100.0, 50.0
 #: exchanged with a sample: drives latch their position at ticks of their own.
 _QUANTISATION, _NOISE_SHARE = 0.5, 1.0 / 16.0
 #: Samples after which the bias has followed a handle that broke loose, and the least way of each,
-#: or of its neighbour where the handle turns [counts]: one that sticks is as heavy as the world. An
-#: elastic shaft hides its turns: there the way goes on in one direction.
-_STEADY, _LEAST_WAY = 6, 1.5
-#: Fastest change of a hand's force [N·m/s]. A torque that changes no faster may be its answer to
-#: the hand, and then says nothing of the mass: a wall that gives way to none looks heavy.
-_HAND_RATE = 8.0
+#: or of its neighbour where the handle turns [counts], and that of a handle that has been calm: one
+#: that sticks is as heavy as the world. An elastic shaft hides its turns: there the way goes on in
+#: one direction.
+_STEADY, _LEAST_WAY, _CALM_LEAST_WAY = 6, 1.5, 0.9
+#: Fastest change of a hand's force, and that of a hand which has been calm [N·m/s]. A torque that
+#: changes no faster may be its answer to the hand, and then says nothing of the mass: a wall that
+#: gives way to none looks heavy. With a calm hand the slower one holds where the torque rises: one
+#: that withdraws still may be fast, but an arm on a wall with a finger's mass in its model swings,
+#: and at first more slowly than a hand may push.
+_HAND_RATE, _CALM_HAND_RATE = 8.0, 1.0
 #: Random walk of that change [N·m/s per √s]: within 10 ms a hand begins to push, and ends.
 _HAND_RATE_WALK = 20.0
 #: Torque that says something whatever friction does, as a multiple of that of a hand.
@@ -208,28 +212,33 @@ def forget_mass(regression: Record) -> None:
 
 
 @compiled
-def learn(regression: Record, estimator: Record, y_sample: float, mass: float) -> bool:
+def learn(regression: Record, estimator: Record, y_sample: float, mass: float, calm: bool) -> bool:
     """Learn from a sample; return True if what is known of the mass has changed.
 
-    estimator: with the torques in flight. mass: the one in force.
+    estimator: with the torques in flight. mass: the one in force. calm: True if the handle has not
+    moved fast for a while; of no meaning on an elastic shaft.
     """
     mass -= regression.rotor
     if regression.rotor > 0.0:
+        calm = False
         _observe(regression, _advance_load(regression, y_sample))
     else:
         _add_direction(regression, y_sample)
         _observe(regression, y_sample)
     steps = _torque_steps(estimator) * regression.period * regression.period
     explained = _is_explained(regression, steps)
-    _note_way(regression, y_sample, explained)
+    _note_way(regression, y_sample, explained, _CALM_LEAST_WAY if calm else _LEAST_WAY)
     _let_push_change(regression, mass)
     told = abs(_torque_surprise(regression)) / regression.hand_torque
-    if told <= 1.0:
+    least = _CALM_HAND_RATE / _HAND_RATE if calm else 1.0
+    if told <= least:
         _note_noise(regression, mass)
     if not explained:
         _doubt(regression)
         return True
-    tells = regression.steady >= _STEADY and (regression.probed > 0 or told > 1.0)
+    if not torque_rises(regression, estimator):
+        least = 1.0
+    tells = regression.steady >= _STEADY and (regression.probed > 0 or told > least)
     if tells or told > _STRONG:
         untimely = _UNTIMELY * steps / mass + _UNTIMELY * steps * regression.softness
         _add_information(regression, untimely, mass)
@@ -301,6 +310,12 @@ def _torque_surprise(regression: Record) -> float:
 
 
 @compiled
+def torque_rises(regression: Record, estimator: Record) -> bool:
+    """Return True if the torque that acts becomes larger, as the observer sees it."""
+    return _torque_surprise(regression) * estimator.in_flight[estimator.delay_periods] < 0.0
+
+
+@compiled
 def _torque_steps(estimator: Record) -> float:
     """Return the sum of the last two steps of the torque that acted, without sign [N·m]."""
     steps = 0.0
@@ -321,9 +336,9 @@ def _is_explained(regression: Record, steps: float) -> bool:
 
 
 @compiled
-def _note_way(regression: Record, y_sample: float, explained: bool) -> None:
+def _note_way(regression: Record, y_sample: float, explained: bool, least_way: float) -> None:
     way = y_sample - regression.samples[0]
-    least = _LEAST_WAY * regression.resolution
+    least = least_way * regression.resolution
     if regression.rotor > 0.0:
         goes_on = abs(way) >= least and way * regression.way >= 0.0
     else:

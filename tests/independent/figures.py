@@ -106,14 +106,15 @@ def first_strikes(
     return depths, exits
 
 
-def after_change(bench: Bench, before: Operator, later: Operator) -> tuple[float, float]:
-    """Return the time after a change of grip until the force is quiet [s], and its burst [N].
+def after_change(bench: Bench, before: Operator, later: Operator) -> tuple[float, float, float]:
+    """Return the time after a change of grip until the force is quiet, and since it was loud [s].
 
     The mass and the damping of the hand change in contact. Quiet is a felt ripple below 0.3 N
-    r.m.s. over 20 ms.
+    r.m.s. over 20 ms. In friction nothing may move for long: then the force is loud late. The
+    third value is the burst of the force [N].
     """
     change_s = 0.4
-    longest = burst = 0.0
+    longest = loud_for = burst = 0.0
     for strike in STRIKES[::2]:
         s = bench.strike(before, strike._replace(change_s=change_s), 200.0, later=later)
         rate = FORCES / s.period
@@ -122,9 +123,11 @@ def after_change(bench: Bench, before: Operator, later: Operator) -> tuple[float
         window = round(0.02 * rate)
         power = np.convolve(felt**2, np.full(window, 1.0 / window), "same")
         loud = np.flatnonzero(power > 0.3**2)
-        longest = max(longest, (loud[-1] + 1) / rate if len(loud) else 0.0)
+        if len(loud):
+            longest = max(longest, (loud[-1] + 1) / rate)
+            loud_for = max(loud_for, (loud[-1] + 1 - loud[0]) / rate)
         burst = max(burst, float(np.max(np.abs(felt))))
-    return longest, burst
+    return longest, loud_for, burst
 
 
 def main() -> None:
@@ -150,8 +153,11 @@ def main() -> None:
     bench = Bench(unknown_hand(servo, **{"wall.cap": 0.8}), servo)
     hands = {name: hand for name, hand in OPERATORS.items() if hand.mass > 0.0}
     for (name, hand), (other, later) in permutations(hands.items(), 2):
-        quiet_s, burst = after_change(bench, hand, later)
-        print(f"{name} to {other}: quiet after {1e3 * quiet_s:.0f} ms, burst {burst:.1f} N")
+        quiet_s, loud_s, burst = after_change(bench, hand, later)
+        print(
+            f"{name} to {other}: quiet after {1e3 * quiet_s:.0f} ms, "
+            f"loud for {1e3 * loud_s:.0f} ms, burst {burst:.1f} N"
+        )
 
 
 if __name__ == "__main__":

@@ -45,14 +45,16 @@ def send(regression: NDArray[np.void], estimator: NDArray[np.void], torque: floa
     estimator["in_flight"][0, 0] = torque
 
 
-def play(mass: float, torques: Array, push: Array, jitter: float = 0.0) -> tuple[float, float]:
+def play(
+    mass: float, torques: Array, push: Array, jitter: float = 0.0, calm: bool = False
+) -> tuple[float, float]:
     """Return 1/m and its deviation after torques that act at once, beside a hand's push."""
     regression, estimator = made(), np.zeros(1, ESTIMATOR)
     rng = np.random.default_rng(1)
     y, v, known = 0.0, -0.5, LIGHTEST
     for torque, pushed in zip(torques.tolist(), push.tolist(), strict=True):
         sample = COUNT * round((y + jitter * v * rng.uniform(-0.5, 0.5)) / COUNT)
-        learn(regression[0], estimator[0], sample, known)
+        learn(regression[0], estimator[0], sample, known, calm)
         known = mass_known(regression, known)
         send(regression, estimator, torque)
         a = (torque + pushed - 0.01 * v) / mass
@@ -116,7 +118,7 @@ def test_another_hand_is_another_mass() -> None:
     for j in range(200):
         mass = 3.6e-3 if j < 100 else 2e-4
         torque = 0.4 if j % 40 < 3 else 0.0
-        learn(regression[0], estimator[0], COUNT * round(y / COUNT), known)
+        learn(regression[0], estimator[0], COUNT * round(y / COUNT), known, False)
         known = mass_known(regression, known)
         send(regression, estimator, torque)
         a = torque / mass
@@ -134,7 +136,7 @@ def swing(delay: float, told: float, mass: float) -> NDArray[np.void]:
     share = (delay - 1.0) * PERIOD
     rng = np.random.default_rng(2)
     for _ in range(150):
-        learn(regression[0], estimator[0], COUNT * round(y / COUNT), known)
+        learn(regression[0], estimator[0], COUNT * round(y / COUNT), known, False)
         known = mass_known(regression, known)
         older, newer = estimator["in_flight"][0, 1], estimator["in_flight"][0, 0]
         send(regression, estimator, (0.2 + 300.0 * mass) * rng.choice([-1.0, 0.0, 1.0]))
@@ -190,13 +192,35 @@ def test_swing_against_friction_tells_the_mass(mass: float) -> None:
     y, v, known = 0.0, 0.0, 2.0 * mass
     for j in range(200):
         torque = 250.0 * mass * math.sin(2.0 * math.pi * j / 10.0)
-        learn(regression[0], estimator[0], COUNT * round(y / COUNT), known)
+        learn(regression[0], estimator[0], COUNT * round(y / COUNT), known, False)
         found, deviation = solve(regression[0], known)
         known = 1.0 / max(found, 200.0)
         send(regression, estimator, torque)
         y, v, _ = advance(plant[0], y, v, torque, 0.0, PERIOD)
     assert known == pytest.approx(mass, rel=0.1)
     assert deviation < 0.15 * found
+
+
+def test_swing_as_slow_as_a_hand_pushes_tells_the_mass_of_a_calm_hand() -> None:
+    """With a finger's mass in its model the wall of an arm swings at some 20 Hz."""
+    t, arm = PERIOD * np.arange(300), 3.6e-3
+    swing = 0.15 + 0.05 * np.sin(2.0 * np.pi * 18.0 * t)
+    assert np.abs(np.diff(swing)).max() / PERIOD < 8.0
+    push = np.full(300, -0.15)
+    found, _ = play(arm, swing, push, calm=True)
+    assert 1.5e-3 < 1.0 / found < 1.5 * arm
+    found, _ = play(arm, swing, push)
+    assert 1.0 / found < 1e-3
+
+
+def test_torque_that_falls_with_a_hand_tells_nothing_of_a_calm_one() -> None:
+    """Where one withdraws within 25 ms, a wall gives way to it, and the handle hardly moves."""
+    slowly, fast = np.linspace(0.0, 0.15, 300), np.linspace(0.15, 0.0, 25)
+    falling = np.concatenate([slowly, fast])
+    push = -falling
+    push[-25:] += LIGHTEST * 10.0
+    found, _ = play(LIGHTEST, falling, push, calm=True)
+    assert 1.0 / found < 2.0 * LIGHTEST
 
 
 def test_torque_that_something_holds_tells_nothing() -> None:
@@ -208,7 +232,7 @@ def test_torque_that_something_holds_tells_nothing() -> None:
         estimator["in_flight"] = torque
         begin_regression(regression[0], 0.0, held)
         for _ in range(60):
-            learn(regression[0], estimator[0], 0.0, LIGHTEST)
+            learn(regression[0], estimator[0], 0.0, LIGHTEST, False)
             send(regression, estimator, torque)
         found.append(mass_known(regression, LIGHTEST))
     assert found[0] == pytest.approx(LIGHTEST, rel=0.2)
