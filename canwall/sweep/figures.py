@@ -44,7 +44,8 @@ def write_sweep_figures(dataset: xr.Dataset, stem: Path) -> list[Path]:
         Paths of the figures.
 
     Raises:
-        InputError: If the sweep is a single point or the figures cannot be written.
+        InputError: If the sweep is a single point, or the result of a table, or the figures
+            cannot be written.
     """
     written: list[Path] = []
     for name, figure in draw_sweep(dataset):
@@ -61,8 +62,13 @@ def write_sweep_figures(dataset: xr.Dataset, stem: Path) -> list[Path]:
 def draw_sweep(dataset: xr.Dataset) -> Iterator[tuple[str, Figure]]:
     """Yield name and figure of everything that the axes of the sweep allow to be drawn.
 
-    Raises InputError if the sweep is a single point.
+    Raises InputError if the sweep is a single point, or the result of a table.
     """
+    if "table" in dataset.attrs:
+        raise InputError(
+            f"{dataset.attrs['title']}: a table has no figures; canwall sweep --table "
+            f"{dataset.attrs['table']} prints it"
+        )
     kinds = _kinds(dataset)
     if not kinds:
         raise InputError("the sweep has a single point: there is nothing to draw")

@@ -131,6 +131,21 @@ def test_other_tables(table: str, capsys: pytest.CaptureFixture[str]) -> None:
         assert cell == "–" or float(re.findall(r"[\d.e-]+", cell)[0]) >= 0.0
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("small")
+@pytest.mark.parametrize("table", ["cap", "shaft"])
+def test_a_table_has_no_figures(
+    table: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    result = tmp_path / "table.nc"
+    assert run("sweep", SERVO, "--table", table, "--operator", "none", "--output", result) == 0
+    capsys.readouterr()
+    assert run("plot", result) == 2
+    said = capsys.readouterr().err
+    assert said.endswith(f": a table has no figures; canwall sweep --table {table} prints it\n")
+    assert len(said.splitlines()) == 1
+
+
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
