@@ -83,10 +83,12 @@ def test_python_takes_from_the_ring_between_two_fences(monkeypatch: pytest.Monke
 
 @njit(nogil=True)  # type: ignore[untyped-decorator]
 def put_too_early(headers: Any, rows: Any, row: Any) -> None:
-    """`put_row` as a processor may execute it without release order."""
+    """`put_row` as a processor may execute it without release order, microseconds early."""
     header = headers[0]
     head = header.row_head
     store_release(header, "row_head", head + 1)
+    for _ in range(2000):  # Longer than the other side takes from the counter to the rows.
+        load_acquire(header, "row_tail")
     rows[head % len(rows)] = row[0]
 
 
