@@ -5,8 +5,8 @@ loop; `[operator]` says if they find the operator, `[wall]` which damping ratio 
 Laws that use the sampled position alone have none of that.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
@@ -15,7 +15,7 @@ from scipy.stats import qmc
 from canwall.config import Settings
 from canwall.cycle import named_law
 from canwall.errors import InputError, did_you_mean
-from canwall.sweep.axes import STRIKES
+from canwall.sweep.axes import STRIKES, SweepAxis
 from canwall.sweep.dataset import assemble_dataset
 from canwall.sweep.plan import Plan, make_plan
 from canwall.sweep.strike import OPERATORS, SERVOS
@@ -63,20 +63,20 @@ class LawTable:
         title: Its title.
         laws: Its laws unless others are asked for; empty: that of the configuration.
         axes: Axes besides those of every table, by name.
-        draws: Number of strikes with stiffness, speed and phase drawn at random; 0: those of the
-            axes.
         searches: True if its cells are K-limits.
         capped: True if `wall.cap` stays in force.
         write: Writes the result as Markdown, line by line.
+        draws: Number of strikes with stiffness, speed and phase drawn at random; 0: those of the
+            axes.
     """
 
     title: str
     laws: tuple[str, ...]
     axes: dict[str, Sequence[float | str]]
-    draws: int
     searches: bool
     capped: bool
     write: Callable[[xr.Dataset], Iterator[str]]
+    draws: int = 0
 
 
 def compute_law_table(
@@ -161,8 +161,10 @@ def _make_plans(
     if not table.capped:
         base = base.model_copy(update={"wall": base.wall.model_copy(update={"cap": None})})
     if table.draws:
-        drawn = drawn_strikes(table.draws)
-        return [make_plan(base, {"law": laws, **shared, **strike}, through) for strike in drawn]
+        strikes = list(drawn_strikes(table.draws))
+        # Checked once: the conditions of all are the same.
+        plan = make_plan(base, {"law": laws, **shared, **strikes[0]}, through)
+        return [_struck_otherwise(plan, strike) for strike in strikes]
     if not table.searches:
         return [make_plan(base, {"law": laws, **shared}, through)]
     plain = {"damping_ratio": None, "damping_nm_s_per_rad": 0.0}
@@ -183,6 +185,11 @@ def _make_plans(
             axes = {"law": some, "damping_normalised": dampings, **axes}
             plans.append(make_plan(settings, axes, through))
     return plans
+
+
+def _struck_otherwise(plan: Plan, strike: Mapping[str, float]) -> Plan:
+    axes = {name: SweepAxis(name, (strike[name],)) for name in _DRAWN}
+    return replace(plan, stiffness=axes["stiffness"], speed=axes["speed"], phase=axes["phase"])
 
 
 def drawn_strikes(count: int) -> Iterator[dict[str, float]]:
@@ -366,7 +373,6 @@ LAW_TABLES = {
         "K-limits of the laws in unknown hands",
         _WITH_STIFFNESS,
         _SERVOS_AND_FRICTIONS | {"delay_error": DELAY_ERRORS},
-        0,
         True,
         False,
         _write_laws,
@@ -375,17 +381,16 @@ LAW_TABLES = {
         "Walls with a cap in unknown hands",
         (),
         _SERVOS_AND_FRICTIONS | {"delay_error": DELAY_ERRORS, "wall.cap": CAPS},
-        DRAWS,
         False,
         True,
         _write_cap,
+        DRAWS,
     ),
     "first-strike": LawTable(
         "First strike of an unknown hand",
         (),
         _SERVOS_AND_FRICTIONS
         | {"stiffness": (_FIRST_STIFFNESS,), "speed": _FIRST_SPEEDS, "phase": _FIRST_PHASES},
-        0,
         False,
         False,
         _write_first_strikes,
@@ -394,7 +399,6 @@ LAW_TABLES = {
         "K-limits on an elastic shaft",
         ("standard", "damped", "half_sample", "mean_force"),
         {"servo": ("1600Hz",), "friction": (_FRICTION,), "simulation.shaft_hz": _SHAFTS},
-        0,
         True,
         False,
         _write_shafts,

@@ -107,11 +107,11 @@ def first_strikes(
 
 
 def after_change(bench: Bench, before: Operator, later: Operator) -> tuple[float, float, float]:
-    """Return the time after a change of grip until the force is quiet, and since it was loud [s].
+    """Return how long after a change of grip the force is quiet, how long it was loud, its burst.
 
-    The mass and the damping of the hand change in contact. Quiet is a felt ripple below 0.3 N
-    r.m.s. over 20 ms. In friction nothing may move for long: then the force is loud late. The
-    third value is the burst of the force [N].
+    Times in s, the burst in N. The mass and the damping of the hand change in contact. Quiet is a
+    felt ripple below 0.3 N r.m.s. over 20 ms. In friction nothing may move for long, and the force
+    becomes loud late.
     """
     change_s = 0.4
     longest = loud_for = burst = 0.0
