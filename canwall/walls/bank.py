@@ -303,6 +303,8 @@ def _identify(bank: Record, estimator: Record, y_sample: float) -> bool:
     """Follow what a sample tells of the mass; return True if the mass in force changed."""
     regression, calm = bank.regression[0], bank.lively_left == 0
     learned = learn(regression, estimator, y_sample, bank.mass, calm)
+    if regression.swung:
+        bank.known = False
     if _torque_acted(estimator):
         bank.at_rest = 0
         return learned and not bank.holds and _follow(bank, torque_rises(regression, estimator))

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from canwall.compiled import Record, compiled
 from canwall.walls.estimator import MAX_DELAY, unit_motion
 from canwall.walls.shaft import ElasticShaft
+from canwall.walls.swing import SWING, end_swing, follow_swing, lightness_of_swing, set_swing
 
 #: Number of samples that are kept: two differences give the velocity to come.
 _RECENT = 3
@@ -60,6 +61,8 @@ REGRESSION = np.dtype(
         ("information", "f8", (6, 6)),  # weighted sums of their products
         ("normal", "f8", (6, 6)),  # the same with what is known before, as it is being solved
         ("noise", "f8"),  # mean square of what nothing explains [rad²]
+        ("swing", SWING, (1,)),
+        ("swung", "?"),  # a swing has told, at this sample, that the hand is a heavier one
         ("hand_torque", "f8"),  # surprise by a torque that changes as fast as a hand's
         ("hand_change", "f8"),  # by how much that surprise changes until the next sample
         ("samples", "f8", (_RECENT,)),  # the last ones, newest first [rad]
@@ -92,6 +95,8 @@ _STEADY, _LEAST_WAY, _CALM_LEAST_WAY = 6, 1.5, 0.9
 #: that withdraws still may be fast, but an arm on a wall with a finger's mass in its model swings,
 #: and at first more slowly than a hand may push.
 _HAND_RATE, _CALM_HAND_RATE = 8.0, 1.0
+#: Mass over the one in force from which on a swing tells of another hand.
+_HEAVIER = 1.5
 #: Random walk of that change [N·m/s per √s]: within 10 ms a hand begins to push, and ends.
 _HAND_RATE_WALK = 20.0
 #: Torque that says something whatever friction does, as a multiple of that of a hand.
@@ -149,6 +154,7 @@ def set_regression(
     regression["softness"] = 1.0 / (shaft.stiffness * period**2) if shaft else 0.0
     regression["lightest"] = lightest - regression["rotor"]
     regression["delay"] = delay
+    set_swing(regression["swing"][0], period, count)
     bandwidth = _OBSERVER_BEHIND_SHAFT_HZ if shaft else _OBSERVER_HZ
     regression["gain"] = gain = _observer_gain(bandwidth, period)
     regression["surprise"][5] = abs(count)
@@ -183,6 +189,7 @@ def reset_regression(regression: np.void, y: float) -> None:
     regression["observed"][0, 0] = regression["load"] = y
     regression["samples"] = y
     regression["noise"] = (_QUANTISATION * regression["resolution"]) ** 2
+    end_swing(regression["swing"][0])
 
 
 @compiled
@@ -199,6 +206,7 @@ def begin_regression(regression: Record, y: float, torque: float) -> None:
     regression.samples[:] = y
     regression.way = 0.0
     regression.steady = regression.probed = 0
+    end_swing(regression.swing[0])
     regression.noise = (_QUANTISATION * regression.resolution) ** 2
 
 
@@ -229,12 +237,15 @@ def learn(regression: Record, estimator: Record, y_sample: float, mass: float, c
     explained = _is_explained(regression, steps)
     _note_way(regression, y_sample, explained, _CALM_LEAST_WAY if calm else _LEAST_WAY)
     _let_push_change(regression, mass)
+    _follow_swing(regression, estimator, y_sample, mass, calm)
     told = abs(_torque_surprise(regression)) / regression.hand_torque
     least = _CALM_HAND_RATE / _HAND_RATE if calm else 1.0
     if told <= least:
         _note_noise(regression, mass)
     if not explained:
         _doubt(regression)
+        return True
+    if regression.swung:
         return True
     if not torque_rises(regression, estimator):
         least = 1.0
@@ -360,6 +371,33 @@ def _note_noise(regression: Record, mass: float) -> None:
         # What began a few samples ago was taken for an answer to the torque meanwhile.
         _forget(regression, regression.noise / noise)
     regression.noise = noise
+
+
+@compiled
+def _follow_swing(
+    regression: Record, estimator: Record, y_sample: float, mass: float, calm: bool
+) -> None:
+    """Begin anew with what a swing of the wall tells, if that is a heavier hand.
+
+    mass: the one in force. calm: as for `learn`; a blow is none.
+    """
+    swing, r = regression.swing[0], regression.surprise
+    regression.swung = False
+    if not calm or estimator.in_flight[estimator.delay_periods] == 0.0:
+        end_swing(swing)
+        return
+    turns_at = _CALM_HAND_RATE / _HAND_RATE * regression.hand_torque
+    if not follow_swing(swing, y_sample, r[0], _torque_surprise(regression), turns_at):
+        return
+    lightness, deviation, noise = lightness_of_swing(swing)
+    if (lightness + deviation) * mass * _HEAVIER > 1.0:
+        return
+    forget_mass(regression)
+    both, information = swing.both[0], regression.information
+    information[0, 0] = both.rr / noise
+    information[0, 1] = information[1, 0] = both.rt / noise
+    information[1, 1] = both.tt / noise
+    regression.swung = True
 
 
 @compiled

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 from figures import after_change, first_strikes, sampled, unknown_hand
-from plant import FORCES, OPERATORS, SERVOS, STRIKES, Bench, judge, ripple
+from plant import FORCES, OPERATORS, SERVOS, STRIKES, Bench, Servo, judge, ripple
 from scipy.integrate import solve_ivp
 
 pytestmark = pytest.mark.slow
@@ -72,6 +72,19 @@ def test_light_hand_that_takes_over_from_an_arm_is_quiet_soon() -> None:
     _, loud_s, burst = after_change(bench, OPERATORS["arm"], OPERATORS["finger20"])
     assert 0.0 < loud_s < 0.1
     assert burst < 8.0
+
+
+@pytest.mark.parametrize("servo", SERVOS.values(), ids=SERVOS)
+@pytest.mark.parametrize(("light", "heavy"), [("finger", "arm"), ("finger20", "hand")])
+def test_heavy_hand_that_takes_over_without_friction_is_quiet_soon(
+    servo: Servo, light: str, heavy: str
+) -> None:
+    """The wall of the light hand swings, from nothing: it is loud only as long as it is unknown."""
+    servo = servo._replace(coulomb=0.0)
+    bench = Bench(unknown_hand(servo, **{"wall.cap": 0.8}), servo)
+    _, loud_s, burst = after_change(bench, OPERATORS[light], OPERATORS[heavy])
+    assert loud_s < 0.06
+    assert burst < 3.0
 
 
 def test_cap_keeps_any_stiffness_quiet() -> None:

@@ -1,11 +1,16 @@
 """Walls with a cap in hands that the laws do not know: shares of the table in docs/results.md."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from canwall import config
+from canwall.config.hand import Hand
+from canwall.run.closed_loop import simulate
 from canwall.sweep import make_plan
+from canwall.sweep.axes import settings_at
 
 pytestmark = pytest.mark.slow
 
@@ -50,3 +55,33 @@ def test_margin_halves_what_a_delay_costs_that_is_told_too_short(operator: str, 
 def test_a_heavy_hand_does_not_hunt_friction(delay_error: float) -> None:
     """A filter that is slow against the wall has it slip to and fro, at 2 to 4 Hz."""
     assert _strikes("hand", 0.02, delay_error)["chatters_amplitude"].sum() == 0
+
+
+@pytest.mark.parametrize("operator", ["none", "finger", "grip"])
+def test_hand_that_pushes_to_and_fro_is_no_heavier(operator: str) -> None:
+    """At the upper end of tremor, 10 Hz, by ± 20 mN·m about a steady press."""
+    point: dict[str, Any] = {"operator": operator, "law": "mean_force", "model": "drive"}
+    point |= {"servo": "1600Hz", "friction": 0.0, "speed": 0.5, "phase": 0.0, "press": 1.2}
+    settings = settings_at(config.load(config.shipped("config/sim.toml")), point)
+    assert settings.simulation is not None
+    hand = settings.simulation.hand
+    side = 1.0 if hand.press_rad > hand.rest_rad else -1.0
+    mean = 0.0 if hand.stiffness_nm_per_rad else 0.15
+
+    def press(torque: float, duration_s: float) -> dict[str, Any]:
+        return {"move": "press", "torque_nm": side * torque, "duration_s": duration_s}
+
+    moves = [
+        press(mean, 0.3) | {"position_rad": hand.press_rad},
+        {"move": "rest", "duration_s": 0.3},
+        *(press(mean + more, 0.05) for more in [0.02, -0.02] * 10),
+    ]
+    pushing = Hand.model_validate(hand.model_dump() | {"script": moves})
+    simulation = settings.simulation.model_copy(update={"hand": pushing})
+    rows = simulate(
+        settings.model_copy(update={"simulation": simulation, "schedule": ()}), 1700
+    ).rows
+    moving = rows[900:1600]
+    assert np.ptp(moving["torque_cmd"]) > 0.03
+    mass = simulation.inertia_kg_m2 + pushing.inertia_kg_m2
+    assert moving["mass_est"].max() < 1.4 * mass

@@ -1,0 +1,82 @@
+"""A swing that no hand makes, and the mass that it tells."""
+
+import numpy as np
+import pytest
+
+from canwall.walls.swing import SWING, end_swing, follow_swing, lightness_of_swing, set_swing
+
+PERIOD, COUNT = 1e-3, 4.8e-5
+TURNS_AT = 1e-8
+
+
+def first_told(
+    hz: float, mass: float, counts: float = 20.0, begin: int = 0, cycles: int = 300
+) -> tuple[int, float, float]:
+    """Return the sample at which a swing of the torque tells (-1: none does), 1/m, its deviation.
+
+    A torque that goes to and fro moves a mass; the handle goes by `counts` from end to end.
+    """
+    swing = np.zeros(1, SWING)
+    set_swing(swing[0], PERIOD, COUNT)
+    end_swing(swing[0])
+    random = np.random.default_rng(1)
+    for j in range(begin, cycles):
+        phase = 2.0 * np.pi * hz * j * PERIOD
+        torque = 1e-7 * np.sin(phase)
+        position = -torque / mass + random.uniform(-0.5, 0.5) * COUNT
+        y = COUNT * np.rint(-0.5 * counts * np.cos(phase))
+        if follow_swing(swing[0], y, position, torque, TURNS_AT):
+            lightness, deviation, noise = lightness_of_swing(swing[0])
+            assert noise >= (0.5 * COUNT) ** 2
+            return j, lightness, deviation
+    return -1, 0.0, 0.0
+
+
+@pytest.mark.parametrize("mass", [1.4e-4, 4e-4, 1.4e-3, 3.6e-3])
+@pytest.mark.parametrize("hz", [15.0, 30.0, 50.0])
+def test_swing_tells_the_mass_after_two_halves(mass: float, hz: float) -> None:
+    j, lightness, deviation = first_told(hz, mass)
+    halves = 2.0 * j * PERIOD * hz
+    assert 2.0 < halves < 2.5
+    assert abs(lightness - 1.0 / mass) < 3.0 * deviation
+    assert deviation < 0.1 / 1.4e-4
+
+
+def test_direction_at_the_begin_is_no_turn() -> None:
+    """Half of what is seen first may have begun any time before."""
+    j, _, _ = first_told(15.0, 1e-3, begin=25)
+    assert 2.0 * (j - 25) * PERIOD * 15.0 > 2.0
+
+
+@pytest.mark.parametrize(
+    ("hz", "counts"),
+    [
+        pytest.param(8.0, 20.0, id="as a hand pushes"),
+        pytest.param(80.0, 20.0, id="as a blow"),
+        pytest.param(25.0, 2.0, id="sticks"),
+    ],
+)
+def test_what_is_no_swing_tells_nothing(hz: float, counts: float) -> None:
+    assert first_told(hz, 1e-3, counts)[0] == -1
+
+
+def test_pause_ends_a_swing() -> None:
+    swing = np.zeros(1, SWING)
+    set_swing(swing[0], PERIOD, COUNT)
+    end_swing(swing[0])
+    told = []
+    for j in range(500):
+        halves = int(j / 20)
+        # Every two halves are followed by 120 ms without a torque.
+        torque = 0.0 if halves % 8 > 1 else 1e-7 * (-1.0) ** halves
+        y = COUNT * (j % 20)
+        told.append(follow_swing(swing[0], y, 0.0, torque, TURNS_AT))
+    assert not any(told)
+
+
+@pytest.mark.parametrize("period", [5e-4, 2e-3])
+def test_halves_are_judged_in_seconds(period: float) -> None:
+    swing = np.zeros(1, SWING)
+    set_swing(swing[0], period, COUNT)
+    assert swing["shortest"][0] * period == pytest.approx(0.008)
+    assert swing["longest"][0] * period == pytest.approx(0.042)
