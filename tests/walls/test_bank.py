@@ -127,6 +127,8 @@ def test_mass_that_was_known_grows_slowly_in_doubt(known: bool) -> None:
     play(bank, estimator, 2.5e-4, pulses(0.3))
     assert bank["known"][0]
     bank["known"] = known
+    # It moves by up to 60 counts a sample: on a calm one, pulses to and fro would be a swing.
+    bank["lively_left"] = bank["lively"]
     before = bank["mass"][0]
     # It is forgotten, and the next torques move the handle as they would a tenfold mass.
     bank["regression"]["information"] = 0.0
