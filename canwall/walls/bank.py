@@ -18,10 +18,12 @@ from canwall.compiled import Record, compiled
 from canwall.walls.bank_gains import PACES, QUICKER, SHORTEST_DELAY, STEADIEST, set_filters
 from canwall.walls.estimator import MAX_DELAY, set_model, set_model_delay
 from canwall.walls.regression import (
+    HAND_RATE,
     REGRESSION,
     begin_regression,
     forget_mass,
     learn,
+    moves,
     predict_regression,
     probe,
     put_probe_in_flight,
@@ -49,6 +51,16 @@ BANK = np.dtype(
         # [y, ẏ, d] of each filter, and its gain.
         ("state", "f8", (3, MAX_FILTERS)),
         ("gain", "f8", (3, MAX_FILTERS)),
+        # How fast d changes [N·m/s], as filters of light hands find it in flight; their gain for
+        # that, zero: those of heavier ones; what is left of it after a period in contact.
+        ("trend", "f8", (MAX_FILTERS,)),
+        ("gain_in_flight", "f8", (4, MAX_FILTERS)),
+        ("trend_left", "f8"),
+        # Samples since the wall gave a torque, the number from which on that is a flight, and True
+        # in the flight of a handle that moves.
+        ("alone", "i8"),
+        ("flight", "i8"),
+        ("flies", "?"),
         # Gains, `with_velocity` and `equal_samples` for softer and softer walls, each half as stiff
         # as the one before, and for a handle that moves, as parabolas over the bandwidth relative
         # to that for the delay as told; stiffness of the first, number of the one in force, and
@@ -109,6 +121,10 @@ _FOLLOWED = 0.6
 #: are as quick as the lightest [s]: noise is felt at rest alone, and a filter that is slow to find
 #: the push after a blow makes a heavy hand bounce.
 _MOVES, _LIVELY_S = 6.0, 0.2
+#: Time without torque but a probe's after which a handle that moves flies, and time constant with
+#: which the trend of the push is forgotten in contact [s]: what a blow and the push after it do to
+#: an estimate is no trend.
+_FLIGHT_S, _TREND_S = 0.04, 0.0028
 #: Most equal samples from which on a velocity is bounded by them: a filter that is slower than that
 #: finds rest by itself.
 _EQUAL_SAMPLES = 32.0
@@ -160,10 +176,11 @@ def set_bank(
     bank["log_step"] = math.log(masses[-1] / masses[0]) / (n - 1)
     bank["spring"] = spring
     bank["forgotten"], bank["lively"] = round(_FORGOTTEN_S / period), round(_LIVELY_S / period)
+    bank["flight"], bank["trend_left"] = round(_FLIGHT_S / period), math.exp(-period / _TREND_S)
     told = delay - margin
     bank["delay"], bank["told"] = delay, told
     set_regression(bank["regression"][0, 0], float(masses[0]), period, count, told, shaft)
-    bank["stiffest"], bank["within"] = np.inf, 0.0
+    bank["stiffest"], bank["within"], bank["gain_in_flight"] = np.inf, 0.0, 0.0
     bank["steadiest"] = STEADIEST * masses[-1] / period**2
     bank["viscous"][0, :n] = viscous
     set_filters(bank[0], masses, spring, period, count, force_walk, rigid=shaft is None)
@@ -171,7 +188,8 @@ def set_bank(
 
 def reset_bank(bank: NDArray[np.void], y: float) -> None:
     """Begin at rest at y with the lightest hand."""
-    bank["state"] = 0.0
+    bank["state"] = bank["trend"] = 0.0
+    bank["alone"], bank["flies"] = 0, False
     bank["state"][:, 0] = y
     reset_regression(bank["regression"][0, 0], y)
     bank["place"], bank["spread"], bank["known"] = 0.0, 0.0, False
@@ -195,11 +213,17 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
     if not estimator.settled:
         for i in range(n):
             state[0, i], state[1, i], state[2, i] = estimator.y, estimator.v, estimator.d
-        bank.equal = 0
+            bank.trend[i] = 0.0
+        bank.equal = bank.alone = 0
+        bank.flies = False
         begin_regression(bank.regression[0], y_sample, estimator.in_flight[estimator.delay_periods])
         return False
+    _note_flight(bank, estimator)
     for i in range(n):
         residual = y_sample - state[0, i]
+        if bank.flies and bank.gain_in_flight[0, i] > 0.0:
+            _correct_in_flight(bank, i, residual)
+            continue
         residual -= min(max(residual, -bank.within[i]), bank.within[i])
         state[0, i] += gain[0, i] * residual
         state[1, i] += gain[1, i] * residual
@@ -211,10 +235,38 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
     share = bank.place - k
     estimator.y = state[0, k] + share * (state[0, k + 1] - state[0, k])
     estimator.v = state[1, k] + share * (state[1, k + 1] - state[1, k])
-    estimator.d = state[2, k] + share * (state[2, k + 1] - state[2, k])
+    # As it will be on the average up to the end of the force that follows from it.
+    ahead = 0.5 * (1.0 + bank.delay_in_force) * bank.regression[0].period
+    lighter = state[2, k] + ahead * bank.trend[k]
+    heavier = state[2, k + 1] + ahead * bank.trend[k + 1]
+    estimator.d = lighter + share * (heavier - lighter)
     if changed:
         take_over(bank, estimator)
     return changed
+
+
+@compiled
+def _note_flight(bank: Record, estimator: Record) -> None:
+    """Note if the handle is on its way, far from any contact, under no torque but a probe's."""
+    regression = bank.regression[0]
+    alone = True
+    for age in range(estimator.delay_periods, MAX_DELAY + 1):
+        alone &= estimator.in_flight[age] == regression.probes[age]
+    bank.alone = bank.alone + 1 if alone else 0
+    bank.flies = bank.alone > bank.flight and moves(regression)
+
+
+@compiled
+def _correct_in_flight(bank: Record, i: int, residual: float) -> None:
+    """Correct filter i, and how fast the push changes: no faster than that of a hand.
+
+    A light handle is at the wall within a few samples, and what its filter is behind of a push that
+    grows is then missing from the first blow.
+    """
+    state, gain = bank.state, bank.gain_in_flight
+    for c in range(3):
+        state[c, i] += gain[c, i] * residual
+    bank.trend[i] = min(max(bank.trend[i] + gain[3, i] * residual, -HAND_RATE), HAND_RATE)
 
 
 @compiled
@@ -437,8 +489,12 @@ def predict_bank(bank: Record, estimator: Record, force: float, age: float = 0.0
     predict_regression(bank.regression[0], estimator.in_flight, force, age)
     put_probe_in_flight(bank.regression[0], force)
     state, phi = bank.state, bank.phi
+    left = 1.0 if bank.flies else bank.trend_left
     for i in range(bank.count):
-        y, v, d = state[0, i], state[1, i], state[2, i]
+        change = bank.regression[0].period * bank.trend[i]
+        y, v, d = state[0, i], state[1, i], state[2, i] + 0.5 * change
+        state[2, i] += change
+        bank.trend[i] *= left
         a, b = older + d, newer + d
         state[0, i] = phi[0, i] * y + phi[1, i] * v + bank.older[0, i] * a + bank.newer[0, i] * b
         state[1, i] = phi[2, i] * y + phi[3, i] * v + bank.older[1, i] * a + bank.newer[1, i] * b

@@ -1,7 +1,7 @@
 """Bandwidths of the filters of a bank: their gains and models, made outside the cycle.
 
 A filter has a bandwidth for walls of each stiffness and one for a handle that moves; it goes with
-that of the delay. What the steps of the encoder make felt grows with mass and bandwidth; a filter
+that of the delay. Those of light hands have one more for the way to the wall. What the steps of the encoder make felt grows with mass and bandwidth; a filter
 that is too slow for wall and hand makes them bounce, and one that is too quick for friction swings.
 """
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.physics import zoh
-from canwall.walls.estimator import KalmanModel, kalman_model
+from canwall.walls.estimator import KalmanModel, gain_with_trend, kalman_model
 
 #: Stiffnesses for which filters have gains, each half of the one before; after these, gains for a
 #: handle that moves.
@@ -36,6 +36,9 @@ STEADIEST, _QUICKENING, _SOFTEST = 1.0, 1.0 / 6.0, 16.0
 #: smaller the motion: a loop that some damping makes unstable goes on swinging in friction, as that
 #: of a quick filter does with a mass that has little damping of its own.
 _CALM, _CALM_UP_TO = 0.75, 1.25
+#: Bandwidth of the filters that follow how the push of a light hand changes on its way to the wall,
+#: over that of the lightest one in contact.
+_IN_FLIGHT = 0.9
 #: Share of half a count within which a reading does not contradict the prediction of a heavy hand,
 #: whose motion between two samples is known better than that. A light one needs each correction.
 _WITHIN = 0.8
@@ -92,6 +95,9 @@ def set_filters(
         _set_filter(bank, i, kalman_model(*plant, count, walk))
         _set_paces(bank, i, plant, count, walk, slower, rigid)
         _set_torques(bank, i, *plant)
+        if rigid and heavier <= _AS_QUICK:
+            in_flight = _IN_FLIGHT * lightest_bandwidth(bank["told"].item(), period)
+            bank["gain_in_flight"][:, i] = gain_with_trend(*plant, in_flight)
 
 
 def _set_paces(

@@ -116,6 +116,34 @@ def kalman_model(
     return KalmanModel(a, force_noise, prior, gain[:, 0] * scale / count, scale)
 
 
+@functools.lru_cache(maxsize=1024)
+def gain_with_trend(
+    mass: float, viscous: float, spring: float, period: float, bandwidth: float
+) -> tuple[float, float, float, float]:
+    """Return the gain of the Kalman filter on [y, ẏ, d, ḋ] for a quantised position.
+
+    The bias force d is a random walk as in `kalman_model`, of ω = `bandwidth` [rad/s]; its rate of
+    change is one of its own, of ω times that q. What a steady change does is thus no error, where
+    the filter on [y, ẏ, d] is behind by 2·ḋ/ω in d, 2·ḋ/(m·ω²) in ẏ and ḋ/(m·ω³) in y.
+    """
+    from scipy.linalg import solve_discrete_are
+
+    phi, gamma = zoh(mass, viscous, spring, period)
+    a = np.eye(4)
+    a[:2, :2] = phi
+    a[:2, 2] = gamma
+    a[:2, 3] = 0.5 * period * gamma
+    a[2, 3] = period
+    c = np.array([[1.0, 0.0, 0.0, 0.0]])
+    scale = np.array([1.0, bandwidth, mass * bandwidth**2, mass * bandwidth**3])
+    a = a * scale[None, :] / scale[:, None]
+    walk = _QUANTISATION * (bandwidth * period) ** 2
+    noise = np.diag([0.0, 0.0, walk, walk])
+    prior = solve_discrete_are(a.T, c.T, noise, np.array([[_QUANTISATION]]))
+    gain = prior[:, 0] / (prior[0, 0] + _QUANTISATION) * scale
+    return tuple(gain.tolist())
+
+
 def force_walk_of(bandwidth: float, mass: float, period: float, count: float) -> float:
     """Return the walk q of a force [N·m/√s] that gives the filter this bandwidth [rad/s].
 

@@ -94,7 +94,7 @@ _STEADY, _LEAST_WAY, _CALM_LEAST_WAY = 6, 1.5, 0.9
 #: gives way to none looks heavy. With a calm hand the slower one holds where the torque rises: one
 #: that withdraws still may be fast, but an arm on a wall with a finger's mass in its model swings,
 #: and at first more slowly than a hand may push.
-_HAND_RATE, _CALM_HAND_RATE = 8.0, 1.0
+HAND_RATE, _CALM_HAND_RATE = 8.0, 1.0
 #: Mass over the one in force from which on a swing tells of another hand.
 _HEAVIER = 1.5
 #: Random walk of that change [N·m/s per √s]: within 10 ms a hand begins to push, and ends.
@@ -158,7 +158,7 @@ def set_regression(
     bandwidth = _OBSERVER_BEHIND_SHAFT_HZ if shaft else _OBSERVER_HZ
     regression["gain"] = gain = _observer_gain(bandwidth, period)
     regression["surprise"][5] = abs(count)
-    regression["hand_torque"] = _HAND_RATE * period / gain[2]
+    regression["hand_torque"] = HAND_RATE * period / gain[2]
     walk = 0.0 if shaft else _HAND_RATE_WALK
     regression["hand_change"] = walk * math.sqrt(period) * period / gain[2]
     slower = round(_OBSERVER_HZ / bandwidth)
@@ -190,6 +190,12 @@ def reset_regression(regression: np.void, y: float) -> None:
     regression["samples"] = y
     regression["noise"] = (_QUANTISATION * regression["resolution"]) ** 2
     end_swing(regression["swing"][0])
+
+
+@compiled
+def moves(regression: Record) -> bool:
+    """Return True if the handle has moved for a while, by more than the steps of the encoder."""
+    return regression.steady >= _STEADY
 
 
 @compiled
@@ -239,7 +245,7 @@ def learn(regression: Record, estimator: Record, y_sample: float, mass: float, c
     _let_push_change(regression, mass)
     _follow_swing(regression, estimator, y_sample, mass, calm)
     told = abs(_torque_surprise(regression)) / regression.hand_torque
-    least = _CALM_HAND_RATE / _HAND_RATE if calm else 1.0
+    least = _CALM_HAND_RATE / HAND_RATE if calm else 1.0
     if told <= least:
         _note_noise(regression, mass)
     if not explained:
@@ -249,7 +255,7 @@ def learn(regression: Record, estimator: Record, y_sample: float, mass: float, c
         return True
     if not torque_rises(regression, estimator):
         least = 1.0
-    tells = regression.steady >= _STEADY and (regression.probed > 0 or told > least)
+    tells = moves(regression) and (regression.probed > 0 or told > least)
     if tells or told > _STRONG:
         untimely = _UNTIMELY * steps / mass + _UNTIMELY * steps * regression.softness
         _add_information(regression, untimely, mass)
@@ -386,7 +392,7 @@ def _follow_swing(
     if not calm or estimator.in_flight[estimator.delay_periods] == 0.0:
         end_swing(swing)
         return
-    turns_at = _CALM_HAND_RATE / _HAND_RATE * regression.hand_torque
+    turns_at = _CALM_HAND_RATE / HAND_RATE * regression.hand_torque
     if not follow_swing(swing, y_sample, r[0], _torque_surprise(regression), turns_at):
         return
     lightness, deviation, noise = lightness_of_swing(swing)

@@ -32,6 +32,8 @@ from canwall.walls import (
     start_lagging,
     take_over,
 )
+from canwall.walls.estimator import gain_with_trend
+from canwall.walls.shaft import ElasticShaft
 
 PERIOD, COUNT, WALK, DELAY = 1e-3, 4.8e-5, 0.02, 1.35
 MASSES = np.geomspace(1e-4, 4.5e-3, 16)
@@ -474,3 +476,99 @@ def test_handle_that_sticks_is_known_to_rest() -> None:
     # After 24 periods it is off by less than half a count, and would have been by ten.
     assert pushed(True)[24:].max() < 0.5 * stiffness * COUNT
     assert pushed(False)[24:].max() > 10.0 * stiffness * COUNT
+
+
+def test_gain_with_trend_is_that_of_its_riccati_recursion() -> None:
+    mass, viscous, bandwidth = 1.5e-4, 2e-3, 570.0
+    phi, gamma = discrete(mass, viscous, PERIOD)
+    a = np.eye(4)
+    a[:2, :2], a[:2, 2], a[:2, 3], a[2, 3] = phi, gamma, 0.5 * PERIOD * gamma, PERIOD
+    # q of `kalman_model` for this bandwidth, and ω times it, with R = 1/12 of a square count.
+    q = force_walk_of(bandwidth, mass, PERIOD, COUNT)
+    noise = np.diag([0.0, 0.0, q**2, (bandwidth * q) ** 2]) * PERIOD
+    covariance = noise.copy()
+    for _ in range(3000):
+        gain = covariance[:, 0] / (covariance[0, 0] + COUNT**2 / 12.0)
+        covariance = a @ (covariance - np.outer(gain, covariance[0])) @ a.T + noise
+    found = gain_with_trend(mass, viscous, 0.0, PERIOD, bandwidth)
+    np.testing.assert_allclose(found, gain, rtol=1e-6)
+
+
+def pushed(rate: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return Φ of [y, ẏ, d] for the lightest handle, and what a push of this rate [N·m/s] adds."""
+    mass, viscous = float(MASSES[0]), float(VISCOUS[0])
+    a = np.zeros((4, 4))
+    a[0, 1], a[1, 1], a[1, 2], a[2, 3] = 1.0, -viscous / mass, 1.0 / mass, rate
+    phi = expm(a * PERIOD)
+    return phi[:3, :3], phi[:3, 3]
+
+
+def fly(
+    bank: NDArray[np.void], estimator: NDArray[np.void], rate: float, cycles: int
+) -> NDArray[np.float64]:
+    """Let a push that grows at this rate [N·m/s] move the lightest handle; return [y, ẏ, d]."""
+    phi, grown = pushed(rate)
+    x = np.array([0.5, -0.5, 0.0])
+    reset_estimator(estimator, x[0])
+    reset_bank(bank, x[0])
+    for j in range(cycles):
+        correct(estimator[0], x[0])
+        set_pace(bank[0], 1e9)
+        correct_bank(bank[0], estimator[0], x[0])
+        if j < cycles - 1:
+            predict_bank(bank[0], estimator[0], 0.0)
+            predict(estimator[0], 0.0)
+            x = phi @ x + grown
+    return x
+
+
+def test_filter_of_a_light_hand_in_flight_is_not_behind_a_push_that_grows() -> None:
+    rate = -4.0
+    bank, estimator = bank_at(0.0)
+    true = fly(bank, estimator, rate, 40)
+    assert not bank["flies"][0]
+    phi, grown = pushed(rate)
+    left = np.eye(3) - np.outer(bank["gain"][0, :, 0], [1.0, 0.0, 0.0])
+    behind = left @ np.linalg.solve(np.eye(3) - phi @ left, grown)
+    np.testing.assert_allclose(true - bank["state"][0, :, 0], behind, rtol=0.01)
+    true = fly(bank, estimator, rate, 120)
+    assert bank["flies"][0]
+    # Over a period the filter holds the push at its mean: ḋ·T²/(12·m) of the velocity remains.
+    assert np.all(np.abs(true - bank["state"][0, :, 0]) < 0.05 * np.abs(behind))
+    assert bank["trend"][0, 0] == pytest.approx(rate, rel=0.01)
+    # The laws have the push as it will be, on the average, up to the end of their force.
+    ahead = 0.5 * (1.0 + DELAY) * PERIOD
+    assert estimator["d"][0] == pytest.approx(true[2] + ahead * rate, rel=0.01)
+
+
+def test_trend_is_no_faster_than_a_hand_and_ends_in_contact() -> None:
+    bank, estimator = bank_at(0.0)
+    fly(bank, estimator, -30.0, 90)
+    assert bank["trend"][0, 0] == -8.0
+    heavier = MASSES / MASSES[0] > 3.0
+    assert np.all(bank["trend"][0, :16][heavier] == 0.0)
+    for _ in range(10):
+        predict_bank(bank[0], estimator[0], 0.2)
+        predict(estimator[0], 0.2)
+        correct(estimator[0], 0.0)
+        correct_bank(bank[0], estimator[0], 0.0)
+    # In contact from the second sample on, when the torque has begun to act.
+    assert abs(bank["trend"][0, 0]) == pytest.approx(8.0 * math.exp(-8.0e-3 / 2.8e-3))
+    assert not bank["flies"][0]
+
+
+def test_handle_that_rests_does_not_fly() -> None:
+    """Rest bounds the velocity, by the covariance of a filter without a trend."""
+    bank, estimator = bank_at(0.0)
+    play(bank, estimator, 1e-4, np.zeros(120), stuck=True)
+    assert not bank["flies"][0]
+    assert np.all(bank["trend"] == 0.0)
+
+
+def test_no_trend_on_an_elastic_shaft() -> None:
+    bank, _ = bank_at(0.0)
+    light = MASSES / MASSES[0] <= 3.0
+    assert np.all(bank["gain_in_flight"][0, 0, :16][light] > 0.0)
+    shaft = ElasticShaft(1e-4, 0.6e-4, 400.0, 0.02)
+    set_bank(bank, MASSES, VISCOUS, 0.0, PERIOD, COUNT, WALK, DELAY, shaft)
+    assert np.all(bank["gain_in_flight"] == 0.0)
