@@ -1,8 +1,9 @@
 """Bandwidths of the filters of a bank: their gains and models, made outside the cycle.
 
 A filter has a bandwidth for walls of each stiffness and one for a handle that moves; it goes with
-that of the delay. Those of light hands have one more for the way to the wall. What the steps of the encoder make felt grows with mass and bandwidth; a filter
-that is too slow for wall and hand makes them bounce, and one that is too quick for friction swings.
+that of the delay. Those of light hands have one more for the way to the wall. What the steps of the
+encoder make felt grows with mass and bandwidth; a filter that is too slow for wall and hand makes
+them bounce, and one that is too quick for friction swings.
 """
 
 import math
