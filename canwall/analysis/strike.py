@@ -246,9 +246,9 @@ def first_bounce(y: Array, period: float, count: float) -> tuple[float, float]:
 
     Speeds are means over SPAN samples. That of the approach is the fastest of those which end
     within the last SPAN samples before the contact, since a wall may act ahead of its surface; that
-    on leaving is over the first samples outside. Where a wall has stopped the handle before its
-    surface, it creeps in: below a count a sample its speed says nothing, and the restitution is the
-    speed on leaving over a count a sample.
+    on leaving is over the first samples outside, and negative of a handle that turns back in these.
+    Where a wall has stopped the handle before its surface, it creeps in: below a count a sample its
+    speed says nothing, and the restitution is the speed on leaving over a count a sample.
     """
     enter = 0
     while enter < len(y) and y[enter] >= 0.0:

@@ -134,8 +134,10 @@ def test_strikes_come_out_as_on_our_own_drive(drive: Drive, make_rig: RigFactory
     for loop in (own, theirs):
         assert loop.run(700).trips == []
     ours, others = own.rows(), theirs.rows()
-    if drive.name == "ingenia":  # its torque comes in other steps
-        assert others["position_rad"] == pytest.approx(ours["position_rad"], abs=5e-4)
+    if drive.name == "ingenia":
+        # Its torque comes in other steps, the probe's as well: the mass that it tells, and with it
+        # the way after the blow, differs by some per cent of the depth of 7 mrad.
+        assert others["position_rad"] == pytest.approx(ours["position_rad"], abs=7e-4)
         impulses = [np.cumsum(rows["torque_applied"]) * 1e-3 for rows in (ours, others)]
         assert impulses[1] == pytest.approx(impulses[0], abs=3e-3)
         return
