@@ -248,12 +248,8 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
 @compiled
 def _note_flight(bank: Record, estimator: Record) -> None:
     """Note if the handle is on its way, far from any contact, under no torque but a probe's."""
-    regression = bank.regression[0]
-    alone = True
-    for age in range(estimator.delay_periods, MAX_DELAY + 1):
-        alone &= estimator.in_flight[age] == regression.probes[age]
-    bank.alone = bank.alone + 1 if alone else 0
-    bank.flies = bank.alone > bank.flight and moves(regression)
+    bank.alone = 0 if _wall_acted(bank, estimator) else bank.alone + 1
+    bank.flies = bank.alone > bank.flight and moves(bank.regression[0])
 
 
 @compiled
@@ -371,6 +367,16 @@ def _identify(bank: Record, estimator: Record, y_sample: float) -> bool:
 def _torque_acted(estimator: Record) -> bool:
     for age in range(estimator.delay_periods, MAX_DELAY + 1):
         if estimator.in_flight[age] != 0.0:
+            return True
+    return False
+
+
+@compiled
+def _wall_acted(bank: Record, estimator: Record) -> bool:
+    """Return True if a torque other than a probe's acted."""
+    probes = bank.regression[0].probes
+    for age in range(estimator.delay_periods, MAX_DELAY + 1):
+        if estimator.in_flight[age] != probes[age]:
             return True
     return False
 

@@ -97,13 +97,10 @@ def kalman_model(
     poles at ω = (q²/(m²·R·T))^(1/6): one setting follows a light handle faster than a heavy one,
     as their noise allows.
     """
-    from scipy.linalg import solve_discrete_are  # a tenth of a second: not for a drive alone
-
     phi, gamma = zoh(mass, viscous, spring, period)
     a = np.eye(3)
     a[:2, :2] = phi
     a[:2, 2] = gamma
-    c = np.array([[1.0, 0.0, 0.0]])
     # In units of the count, and of the velocity and the force that go with it at the filter's
     # bandwidth, the covariances are of one order, and the Riccati solver keeps its digits.
     omega = (12.0 * force_walk**2 / (mass * mass * count * count * period)) ** (1.0 / 6.0)
@@ -111,9 +108,8 @@ def kalman_model(
     a = a * scale[None, :] / scale[:, None]
     force_noise = period * (force_walk / scale[2]) ** 2
     noise = np.diag([0.0, 0.0, force_noise])
-    prior = solve_discrete_are(a.T, c.T, noise, np.array([[_QUANTISATION]]))
-    gain = prior @ c.T / (c @ prior @ c.T + _QUANTISATION)
-    return KalmanModel(a, force_noise, prior, gain[:, 0] * scale / count, scale)
+    prior, gain = _steady_state(a, noise)
+    return KalmanModel(a, force_noise, prior, gain * scale / count, scale)
 
 
 @functools.lru_cache(maxsize=1024)
@@ -126,22 +122,29 @@ def gain_with_trend(
     change is one of its own, of ω times that q. What a steady change does is thus no error, where
     the filter on [y, ẏ, d] is behind by 2·ḋ/ω in d, 2·ḋ/(m·ω²) in ẏ and ḋ/(m·ω³) in y.
     """
-    from scipy.linalg import solve_discrete_are
-
     phi, gamma = zoh(mass, viscous, spring, period)
     a = np.eye(4)
     a[:2, :2] = phi
     a[:2, 2] = gamma
     a[:2, 3] = 0.5 * period * gamma
     a[2, 3] = period
-    c = np.array([[1.0, 0.0, 0.0, 0.0]])
     scale = np.array([1.0, bandwidth, mass * bandwidth**2, mass * bandwidth**3])
     a = a * scale[None, :] / scale[:, None]
     walk = _QUANTISATION * (bandwidth * period) ** 2
     noise = np.diag([0.0, 0.0, walk, walk])
-    prior = solve_discrete_are(a.T, c.T, noise, np.array([[_QUANTISATION]]))
-    gain = prior[:, 0] / (prior[0, 0] + _QUANTISATION) * scale
-    return tuple(gain.tolist())
+    _, gain = _steady_state(a, noise)
+    return tuple((gain * scale).tolist())
+
+
+def _steady_state(
+    transition: NDArray[np.float64], noise: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the covariance before a sample and the gain, with the position first, in counts."""
+    from scipy.linalg import solve_discrete_are  # a tenth of a second: not for a drive alone
+
+    c = np.eye(1, len(transition))
+    prior = solve_discrete_are(transition.T, c.T, noise, np.array([[_QUANTISATION]]))
+    return prior, prior[:, 0] / (prior[0, 0] + _QUANTISATION)
 
 
 def force_walk_of(bandwidth: float, mass: float, period: float, count: float) -> float:

@@ -14,6 +14,7 @@ from canwall.cycle.state import modelled_delay
 from canwall.walls import (
     BANK,
     ESTIMATOR,
+    ElasticShaft,
     correct,
     correct_bank,
     doubt,
@@ -33,7 +34,6 @@ from canwall.walls import (
     take_over,
 )
 from canwall.walls.estimator import gain_with_trend
-from canwall.walls.shaft import ElasticShaft
 
 PERIOD, COUNT, WALK, DELAY = 1e-3, 4.8e-5, 0.02, 1.35
 MASSES = np.geomspace(1e-4, 4.5e-3, 16)
@@ -494,7 +494,7 @@ def test_gain_with_trend_is_that_of_its_riccati_recursion() -> None:
     np.testing.assert_allclose(found, gain, rtol=1e-6)
 
 
-def pushed(rate: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def growing_push(rate: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return Φ of [y, ẏ, d] for the lightest handle, and what a push of this rate [N·m/s] adds."""
     mass, viscous = float(MASSES[0]), float(VISCOUS[0])
     a = np.zeros((4, 4))
@@ -507,7 +507,7 @@ def fly(
     bank: NDArray[np.void], estimator: NDArray[np.void], rate: float, cycles: int
 ) -> NDArray[np.float64]:
     """Let a push that grows at this rate [N·m/s] move the lightest handle; return [y, ẏ, d]."""
-    phi, grown = pushed(rate)
+    phi, grown = growing_push(rate)
     x = np.array([0.5, -0.5, 0.0])
     reset_estimator(estimator, x[0])
     reset_bank(bank, x[0])
@@ -527,7 +527,7 @@ def test_filter_of_a_light_hand_in_flight_is_not_behind_a_push_that_grows() -> N
     bank, estimator = bank_at(0.0)
     true = fly(bank, estimator, rate, 40)
     assert not bank["flies"][0]
-    phi, grown = pushed(rate)
+    phi, grown = growing_push(rate)
     left = np.eye(3) - np.outer(bank["gain"][0, :, 0], [1.0, 0.0, 0.0])
     behind = left @ np.linalg.solve(np.eye(3) - phi @ left, grown)
     np.testing.assert_allclose(true - bank["state"][0, :, 0], behind, rtol=0.01)
