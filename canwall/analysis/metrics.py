@@ -29,6 +29,9 @@ EVENTS_RATIO = 1.25
 #: Shortest stretch over which a settled position is judged [s].
 SETTLED_S = 0.05
 
+#: Relative rounding of a motion, the difference of two positions.
+_ROUNDING = 1e-9
+
 
 def energy_out(y: Array, force: Array) -> Array:
     """Return the energy that the wall has put out up to each SYNC: W[j] = Σ f·(y[j+1] − y[j]).
@@ -131,6 +134,15 @@ def amplitude_tolerance(stiffness: float, count: float, force_step: float) -> fl
     return max(6.0 * count, 3.0 * force_step / stiffness if stiffness > 0.0 else 0.0)
 
 
+@compiled
+def moves_more(motion: float, referent: float, tolerance: float) -> bool:
+    """Return True if a motion exceeds the referent's by more than `amplitude_tolerance`.
+
+    Exactly six counts do not: as a difference of positions they may come out longer by a rounding.
+    """
+    return motion - referent > (1.0 + _ROUNDING) * tolerance
+
+
 def chatter(
     y: Array,
     referent: Array | None,
@@ -181,7 +193,7 @@ def chatter(
     measured, own = peak_to_peak(y[start:stop]), peak_to_peak(referent[start:stop])
     compared = f"{measured:.3g} peak to peak about the settled contact, referent {own:.3g}"
     reason = f"{compared}, quantisation explains {tolerance:.3g}"
-    if measured - own > tolerance:
+    if moves_more(measured, own, tolerance):
         return Chatter(True, reason, "amplitude")
     return Chatter(True, felt, "ripple") if ripples else Chatter(False, reason)
 

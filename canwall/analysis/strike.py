@@ -145,7 +145,7 @@ def measure_strike(
     into.chatters_counts = metrics.bounces_more(
         into.events, into.referent_events, into.energy_out > into.energy_tolerance
     )
-    into.chatters_amplitude = into.motion - into.referent_motion > tolerance
+    into.chatters_amplitude = metrics.moves_more(into.motion, into.referent_motion, tolerance)
     into.chatters_ripple = metrics.is_felt(into.ripple, into.referent_ripple)
     moves = thrown or into.chatters_counts or into.chatters_amplitude
     into.chatters = moves or into.chatters_ripple

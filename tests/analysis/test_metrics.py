@@ -22,6 +22,7 @@ from canwall.analysis.metrics import (
     contacts,
     energy_out,
     limit_cycle,
+    moves_more,
     settled_stretch,
     strikes,
 )
@@ -239,6 +240,19 @@ def test_makes_and_breaks_are_compared_relatively() -> None:
     assert bounces_more(27, 21, gives_energy=False)
     assert bounces_more(EVENTS_OF_CHATTER, 0, gives_energy=False)
     assert not bounces_more(2, 0, gives_energy=True)
+
+
+@pytest.mark.parametrize("counts", [-3, 1, 7, 1000])
+def test_a_motion_of_six_counts_is_what_quantisation_explains(counts: int) -> None:
+    """As a difference of positions it may come out larger than six counts by a rounding."""
+    count = 2.0 * math.pi / 131072
+    tolerance = amplitude_tolerance(200.0, count, 1e-4)
+    assert tolerance == 6.0 * count
+    positions = np.arange(counts, counts + 200) * count
+    assert np.any(positions[6:] - positions[:-6] > tolerance)
+    for low, high in zip(positions[:-6], positions[6:], strict=True):
+        assert not moves_more(high - low, 0.0, tolerance)
+        assert moves_more(high + 0.5 * count - low, 0.0, tolerance)
 
 
 @pytest.mark.parametrize("referent", [pressing(), None])

@@ -183,14 +183,19 @@ def or_zero(numbers: st.SearchStrategy[float]) -> st.SearchStrategy[float]:
     return st.just(0.0) | numbers
 
 
+def floats(low: float, high: float) -> st.SearchStrategy[float]:
+    """Numbers and zero, but none whose square underflows in scipy's error estimate."""
+    return st.floats(low, high).map(lambda number: round(number, 9))
+
+
 undamped_balls = st.builds(
     Ball,
     stiffness=log_floats(0.1, 100.0),
     mass=log_floats(0.1, 10.0),
     spring=or_zero(log_floats(0.01, 3.0)),
-    gravity=or_zero(st.floats(-1.0, 1.0)),
-    height=st.floats(-1.0, 1.0),
-    speed=st.floats(-3.0, 3.0),
+    gravity=or_zero(floats(-1.0, 1.0)),
+    height=floats(-1.0, 1.0),
+    speed=floats(-3.0, 3.0),
     period=log_floats(0.01, 0.3),
     periods=st.integers(1, 60),
 )
