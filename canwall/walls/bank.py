@@ -51,16 +51,24 @@ BANK = np.dtype(
         # [y, ẏ, d] of each filter, and its gain.
         ("state", "f8", (3, MAX_FILTERS)),
         ("gain", "f8", (3, MAX_FILTERS)),
-        # How fast d changes [N·m/s], as filters of light hands find it in flight; their gain for
-        # that, zero: those of heavier ones; what is left of it after a period in contact.
+        # How fast d changes [N·m/s], as filters of light hands find it in flight and while the hand
+        # begins to press; their gain in flight and, over that of d, in contact [1/s], zero: those
+        # of heavier ones; what is left of it after any other period.
         ("trend", "f8", (MAX_FILTERS,)),
         ("gain_in_flight", "f8", (4, MAX_FILTERS)),
+        ("trend_gain", "f8", (MAX_FILTERS,)),
         ("trend_left", "f8"),
         # Samples since the wall gave a torque, the number from which on that is a flight, and True
         # in the flight of a handle that moves.
         ("alone", "i8"),
         ("flight", "i8"),
         ("flies", "?"),
+        # Samples since the last flight and those in a row under the wall's torque, the most of the
+        # former for a hand that begins to press, and True while it does.
+        ("landed", "i8"),
+        ("pressed", "i8"),
+        ("landing", "i8"),
+        ("presses", "?"),
         # Gains, `with_velocity` and `equal_samples` for softer and softer walls, each half as stiff
         # as the one before, and for a handle that moves, as parabolas over the bandwidth relative
         # to that for the delay as told; stiffness of the first, number of the one in force, and
@@ -125,6 +133,10 @@ _MOVES, _LIVELY_S = 6.0, 0.2
 #: which the trend of the push is forgotten in contact [s]: what a blow and the push after it do to
 #: an estimate is no trend.
 _FLIGHT_S, _TREND_S = 0.04, 0.0028
+#: Time from a flight on in which a hand begins to press, samples under the wall's torque after
+#: which it does, and the most way of one from which its push is told [counts]: before and beyond
+#: these it is a blow, which tells more of delay and mass, and later friction would swing with it.
+_LANDING_S, _PRESSED, _SLOW_WAY = 0.04, 4, 8.0
 #: Most equal samples from which on a velocity is bounded by them: a filter that is slower than that
 #: finds rest by itself.
 _EQUAL_SAMPLES = 32.0
@@ -177,10 +189,12 @@ def set_bank(
     bank["spring"] = spring
     bank["forgotten"], bank["lively"] = round(_FORGOTTEN_S / period), round(_LIVELY_S / period)
     bank["flight"], bank["trend_left"] = round(_FLIGHT_S / period), math.exp(-period / _TREND_S)
+    bank["landing"] = round(_LANDING_S / period)
     told = delay - margin
     bank["delay"], bank["told"] = delay, told
     set_regression(bank["regression"][0, 0], float(masses[0]), period, count, told, shaft)
-    bank["stiffest"], bank["within"], bank["gain_in_flight"] = np.inf, 0.0, 0.0
+    bank["stiffest"], bank["within"] = np.inf, 0.0
+    bank["gain_in_flight"] = bank["trend_gain"] = 0.0
     bank["steadiest"] = STEADIEST * masses[-1] / period**2
     bank["viscous"][0, :n] = viscous
     set_filters(bank[0], masses, spring, period, count, force_walk, rigid=shaft is None)
@@ -190,6 +204,7 @@ def reset_bank(bank: NDArray[np.void], y: float) -> None:
     """Begin at rest at y with the lightest hand."""
     bank["state"] = bank["trend"] = 0.0
     bank["alone"], bank["flies"] = 0, False
+    bank["landed"], bank["pressed"], bank["presses"] = bank["landing"], 0, False
     bank["state"][:, 0] = y
     reset_regression(bank["regression"][0, 0], y)
     bank["place"], bank["spread"], bank["known"] = 0.0, 0.0, False
@@ -214,11 +229,12 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
         for i in range(n):
             state[0, i], state[1, i], state[2, i] = estimator.y, estimator.v, estimator.d
             bank.trend[i] = 0.0
-        bank.equal = bank.alone = 0
-        bank.flies = False
+        bank.equal = bank.alone = bank.pressed = 0
+        bank.flies = bank.presses = False
         begin_regression(bank.regression[0], y_sample, estimator.in_flight[estimator.delay_periods])
         return False
     _note_flight(bank, estimator)
+    slow = abs(y_sample - bank.sampled) <= _SLOW_WAY * bank.regression[0].resolution
     for i in range(n):
         residual = y_sample - state[0, i]
         if bank.flies and bank.gain_in_flight[0, i] > 0.0:
@@ -228,6 +244,8 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
         state[0, i] += gain[0, i] * residual
         state[1, i] += gain[1, i] * residual
         state[2, i] += gain[2, i] * residual
+        if bank.presses and slow:
+            _follow_trend(bank, i, bank.trend_gain[i] * gain[2, i] * residual)
     _bound_velocity(bank, y_sample)
     changed = _identify(bank, estimator, y_sample)
     changed |= _follow_delay(bank, estimator)
@@ -247,14 +265,22 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
 
 @compiled
 def _note_flight(bank: Record, estimator: Record) -> None:
-    """Note if the handle is on its way, far from any contact, under no torque but a probe's."""
+    """Note if the handle flies or is pressed against the wall for the first time after a flight.
+
+    A flight is its way far from any contact, under no torque but a probe's.
+    """
+    regression, now = bank.regression[0], estimator.delay_periods
     bank.alone = 0 if _wall_acted(bank, estimator) else bank.alone + 1
-    bank.flies = bank.alone > bank.flight and moves(bank.regression[0])
+    bank.flies = bank.alone > bank.flight and moves(regression)
+    bank.landed = 0 if bank.flies else bank.landed + 1
+    wall_acts = estimator.in_flight[now] != regression.probes[now]
+    bank.pressed = bank.pressed + 1 if wall_acts else 0
+    bank.presses = bank.landed <= bank.landing and bank.pressed >= _PRESSED
 
 
 @compiled
 def _correct_in_flight(bank: Record, i: int, residual: float) -> None:
-    """Correct filter i, and how fast the push changes: no faster than that of a hand.
+    """Correct filter i, and how fast the push changes.
 
     A light handle is at the wall within a few samples, and what its filter is behind of a push that
     grows is then missing from the first blow.
@@ -262,7 +288,13 @@ def _correct_in_flight(bank: Record, i: int, residual: float) -> None:
     state, gain = bank.state, bank.gain_in_flight
     for c in range(3):
         state[c, i] += gain[c, i] * residual
-    bank.trend[i] = min(max(bank.trend[i] + gain[3, i] * residual, -HAND_RATE), HAND_RATE)
+    _follow_trend(bank, i, gain[3, i] * residual)
+
+
+@compiled
+def _follow_trend(bank: Record, i: int, correction: float) -> None:
+    """Correct how fast the push changes: no faster than that of a hand."""
+    bank.trend[i] = min(max(bank.trend[i] + correction, -HAND_RATE), HAND_RATE)
 
 
 @compiled
@@ -495,7 +527,7 @@ def predict_bank(bank: Record, estimator: Record, force: float, age: float = 0.0
     predict_regression(bank.regression[0], estimator.in_flight, force, age)
     put_probe_in_flight(bank.regression[0], force)
     state, phi = bank.state, bank.phi
-    left = 1.0 if bank.flies else bank.trend_left
+    left = 1.0 if bank.flies or bank.presses else bank.trend_left
     for i in range(bank.count):
         change = bank.regression[0].period * bank.trend[i]
         y, v, d = state[0, i], state[1, i], state[2, i] + 0.5 * change

@@ -40,6 +40,8 @@ _CALM, _CALM_UP_TO = 0.75, 1.25
 #: Bandwidth of the filters that follow how the push of a light hand changes on its way to the wall,
 #: over that of the lightest one in contact.
 _IN_FLIGHT = 0.9
+#: How quickly they follow it in contact, as a part of how quickly they do in flight.
+_IN_CONTACT = 0.3
 #: Share of half a count within which a reading does not contradict the prediction of a heavy hand,
 #: whose motion between two samples is known better than that. A light one needs each correction.
 _WITHIN = 0.8
@@ -98,7 +100,8 @@ def set_filters(
         _set_torques(bank, i, *plant)
         if rigid and heavier <= _AS_QUICK:
             in_flight = _IN_FLIGHT * lightest_bandwidth(bank["told"].item(), period)
-            bank["gain_in_flight"][:, i] = gain_with_trend(*plant, in_flight)
+            bank["gain_in_flight"][:, i] = gain = gain_with_trend(*plant, in_flight)
+            bank["trend_gain"][i] = _IN_CONTACT * gain[3] / gain[2]
 
 
 def _set_paces(

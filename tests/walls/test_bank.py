@@ -541,20 +541,52 @@ def test_filter_of_a_light_hand_in_flight_is_not_behind_a_push_that_grows() -> N
     assert estimator["d"][0] - true[2] == pytest.approx(ahead * rate, rel=0.01)
 
 
-def test_trend_is_no_faster_than_a_hand_and_ends_in_contact() -> None:
+def sticks(
+    bank: NDArray[np.void], estimator: NDArray[np.void], torques: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Let a handle stick under these torques, between two counts; return the ḋ of the lightest."""
+    stuck = float(bank["sampled"][0])
+    trends = []
+    for j, torque in enumerate(torques):
+        y = stuck + (j % 2) * COUNT
+        predict_bank(bank[0], estimator[0], torque)
+        predict(estimator[0], torque)
+        correct(estimator[0], y)
+        correct_bank(bank[0], estimator[0], y)
+        trends.append(float(bank["trend"][0, 0]))
+    return np.array(trends)
+
+
+def test_trend_is_no_faster_than_a_hand_and_is_forgotten_in_a_blow() -> None:
     bank, estimator = bank_at(0.0)
     fly(bank, estimator, -30.0, 90)
     assert bank["trend"][0, 0] == -8.0
     heavier = MASSES / MASSES[0] > 3.0
     assert np.all(bank["trend"][0, :16][heavier] == 0.0)
-    for _ in range(10):
-        predict_bank(bank[0], estimator[0], 0.2)
-        predict(estimator[0], 0.2)
-        correct(estimator[0], 0.0)
-        correct_bank(bank[0], estimator[0], 0.0)
-    # In contact from the second sample on, when the torque has begun to act.
-    assert abs(bank["trend"][0, 0]) == pytest.approx(8.0 * math.exp(-8.0e-3 / 2.8e-3))
+    # The torque begins to act at the second sample.
+    trends = sticks(bank, estimator, np.full(4, 0.2))
     assert not bank["flies"][0]
+    assert trends[0] == 8.0  # a handle that stops at once is all that the flight sees
+    assert trends[3] == pytest.approx(8.0 * math.exp(-2.0e-3 / 2.8e-3))
+    # Out of the wall again it is no push that begins, either.
+    fly(bank, estimator, -30.0, 90)
+    trends = sticks(bank, estimator, np.tile([0.2, 0.2, 0.0, 0.0], 6))
+    assert abs(trends[-1]) < 0.01
+
+
+def test_trend_of_a_hand_that_begins_to_press_is_followed_for_a_while() -> None:
+    """On a handle that sticks d is minus the torque: 40 ms after the flight its lag is back."""
+    rate = 4.0
+    bank, estimator = bank_at(0.0)
+    fly(bank, estimator, 0.0, 60)
+    assert bank["flies"][0]
+    torques = rate * PERIOD * np.arange(120.0)
+    trends = sticks(bank, estimator, torques)
+    assert np.all(np.abs(trends[30:40] + rate) < 0.25 * rate)
+    assert np.all(np.abs(trends[70:]) < 1e-3)
+    # No flight, no trend: friction and a filter that integrates twice would hunt each other.
+    bank, estimator = bank_at(0.0)
+    assert np.all(sticks(bank, estimator, torques) == 0.0)
 
 
 def test_handle_that_rests_does_not_fly() -> None:
@@ -572,3 +604,4 @@ def test_no_trend_on_an_elastic_shaft() -> None:
     shaft = ElasticShaft(1e-4, 0.6e-4, 400.0, 0.02)
     set_bank(bank, MASSES, VISCOUS, 0.0, PERIOD, COUNT, WALK, DELAY, shaft)
     assert np.all(bank["gain_in_flight"] == 0.0)
+    assert np.all(bank["trend_gain"] == 0.0)
