@@ -133,9 +133,10 @@ _MOVES, _LIVELY_S = 6.0, 0.2
 #: which the trend of the push is forgotten in contact [s]: what a blow and the push after it do to
 #: an estimate is no trend.
 _FLIGHT_S, _TREND_S = 0.04, 0.0028
-#: Time from a flight on in which a hand begins to press, samples under the wall's torque after
-#: which it does, and the most way of one from which its push is told [counts]: before and beyond
-#: these it is a blow, which tells more of delay and mass, and later friction would swing with it.
+#: Time after a flight in which a hand begins to press [s], the sample under the wall's torque from
+#: which on it does, and the longest way of one that tells how its push changes [counts]. Earlier
+#: and faster it is a blow, whose errors are those of delay and mass; later, with friction, the
+#: trend would make the handle hunt.
 _LANDING_S, _PRESSED, _SLOW_WAY = 0.04, 4, 8.0
 #: Most equal samples from which on a velocity is bounded by them: a filter that is slower than that
 #: finds rest by itself.
@@ -234,7 +235,8 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
         begin_regression(bank.regression[0], y_sample, estimator.in_flight[estimator.delay_periods])
         return False
     _note_flight(bank, estimator)
-    slow = abs(y_sample - bank.sampled) <= _SLOW_WAY * bank.regression[0].resolution
+    slow = _SLOW_WAY * bank.regression[0].resolution
+    follows = bank.presses and abs(y_sample - bank.sampled) <= slow
     for i in range(n):
         residual = y_sample - state[0, i]
         if bank.flies and bank.gain_in_flight[0, i] > 0.0:
@@ -244,7 +246,7 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
         state[0, i] += gain[0, i] * residual
         state[1, i] += gain[1, i] * residual
         state[2, i] += gain[2, i] * residual
-        if bank.presses and slow:
+        if follows:
             _follow_trend(bank, i, bank.trend_gain[i] * gain[2, i] * residual)
     _bound_velocity(bank, y_sample)
     changed = _identify(bank, estimator, y_sample)
@@ -265,7 +267,7 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
 
 @compiled
 def _note_flight(bank: Record, estimator: Record) -> None:
-    """Note if the handle flies or is pressed against the wall for the first time after a flight.
+    """Note if the handle flies, or is pressed against the wall shortly after a flight.
 
     A flight is its way far from any contact, under no torque but a probe's.
     """
