@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from canwall.analysis.felt import HANDLE_RADIUS_M
 from canwall.analysis.metrics import STRIKE_GAP_S
 from canwall.config import Guard, Limits, Operator, Settings, Wall
 from canwall.cycle.guard import GUARD, change_guard, set_guard
@@ -276,8 +277,19 @@ def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None
         if bandwidth < math.inf:
             force_walk = force_walk_of(bandwidth, mass, period, abs(count))
     if settings.operator.adapt:
-        bank = cycle["bank"][0]
-        set_bank(bank, masses, dampings, spring, period, count, force_walk, delay, shaft, margin)
+        set_bank(
+            cycle["bank"][0],
+            masses,
+            dampings,
+            spring,
+            period,
+            count,
+            force_walk,
+            delay,
+            shaft,
+            margin,
+            settings.mechanics.handle_radius_m or HANDLE_RADIUS_M,
+        )
     set_estimator(
         cycle["estimator"][0],
         mass,
@@ -291,7 +303,7 @@ def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None
         margin,
     )
     set_latch(cycle["latch"][0, 0], period, settings.drive.drive_cycle_s, count)
-    _bound_by_shaft(cycle)
+    _bound_stiffness(cycle)
     _reset(cycle, float(cycle["oriented"][0]))
 
 
@@ -309,45 +321,45 @@ def _shaft(settings: Settings) -> ElasticShaft | None:
     )
 
 
-def _bound_by_shaft(cycle: NDArray[np.void]) -> None:
-    """Set the stiffness of the stiffest wall on an elastic shaft, for each hand."""
+def _bound_stiffness(cycle: NDArray[np.void]) -> None:
+    """Set the stiffness of the stiffest wall, where there is a cap: on a shaft for each hand."""
     shaft = ElasticShaft(*cycle["shaft"][0].tolist())
     rendered, bank, estimator = (cycle[name][0, 0] for name in ("rendered", "bank", "estimator"))
-    wall = rendered["wall"]
-    if not (shaft.resonance_hz and wall["cap"][0]):
+    wall, n = rendered["wall"], bank["count"].item()
+    if not wall["cap"][0]:
         return
-    before, period = estimator["before"]["duration"], cycle["period"].item()
-    closing = (
-        bool(rendered["sampled"]),
-        wall["asked_damping"].item(),
-        wall["damping_ratio"].item(),
-        period,
-        estimator["delay_periods"].item() + before.item() / period,
-    )
-    n = bank["count"].item()
-    for i in range(n):
-        mass = math.exp(bank["log_lightest"] + i * bank["log_step"])
-        gain = tuple(bank["steady_gain"][:, i].tolist())
-        loop = WallLoop(mass, bank["viscous"][i].item(), gain, *closing)
-        bank["stiffest"][i] = stiffest_wall(shaft, loop)
+    if shaft.resonance_hz:
+        before, period = estimator["before"]["duration"], cycle["period"].item()
+        closing = (
+            bool(rendered["sampled"]),
+            wall["asked_damping"].item(),
+            wall["damping_ratio"].item(),
+            period,
+            estimator["delay_periods"].item() + before.item() / period,
+        )
+        for i in range(n):
+            mass = math.exp(bank["log_lightest"] + i * bank["log_step"])
+            gain = tuple(bank["steady_gain"][:, i].tolist())
+            loop = WallLoop(mass, bank["viscous"][i].item(), gain, *closing)
+            bank["stiffest"][i] = stiffest_wall(shaft, loop)
+        if not n:
+            known = estimator["mass"].item(), estimator["viscous"].item()
+            gain = tuple(estimator["steady_gain"].tolist())
+            wall["stiffest"] = stiffest_wall(shaft, WallLoop(*known, gain, *closing))
     if n:
         wall["stiffest"] = np.interp(bank["place"], np.arange(n), bank["stiffest"][:n])
-    else:
-        known = estimator["mass"].item(), estimator["viscous"].item()
-        gain = tuple(estimator["steady_gain"].tolist())
-        wall["stiffest"] = stiffest_wall(shaft, WallLoop(*known, gain, *closing))
 
 
 def stiffest_for(cycle: NDArray[np.void], mass: float) -> float:
-    """Return the stiffness of the stiffest wall on the shaft in a hand, inf for a rigid one.
+    """Return the stiffness of the stiffest wall in a hand, inf where nothing bounds it.
 
     Args:
         cycle: An array of dtype CYCLE, shape (1,).
         mass: Inertia of all that moves [kg·m²].
     """
-    bank = cycle["bank"][0, 0]
-    if not (n := bank["count"].item()):
-        return float(cycle["rendered"][0, 0]["wall"]["stiffest"][0])
+    bank, wall = cycle["bank"][0, 0], cycle["rendered"][0, 0]["wall"]
+    if not (wall["cap"][0] and (n := bank["count"].item())):
+        return float(wall["stiffest"][0])
     place = (math.log(mass) - bank["log_lightest"]) / bank["log_step"]
     return float(np.interp(place, np.arange(n), bank["stiffest"][:n]))
 
@@ -415,7 +427,7 @@ def set_wall(cycle: NDArray[np.void], wall: Wall, laws: Sequence[Law]) -> None:
     known["damping_ratio"], known["cap"] = wall.damping_ratio or 0.0, wall.cap or 0.0
     known["tension"] = TENSION[wall.tension]
     known["passivity_damping"] = wall.passivity_nm_s_per_rad
-    _bound_by_shaft(cycle)
+    _bound_stiffness(cycle)
     if index != rendered["law"]:
         rendered["law"] = index
         clear_memory(known)

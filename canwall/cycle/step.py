@@ -129,8 +129,7 @@ def _identify_operator(cycle: Record, sample: float) -> None:
     if correct_bank(bank, estimator, sample):
         wall = cycle.rendered[0].wall[0]
         change_plant(wall, estimator.mass, estimator.viscous)
-        if bank.regression[0].rotor > 0.0:
-            wall.stiffest = stiffest(bank)
+        wall.stiffest = stiffest(bank)
         if cycle.fade_left > 0:
             change_plant(cycle.faded[0].wall[0], estimator.mass, estimator.viscous)
         if cycle.compares_lag:

@@ -6,7 +6,7 @@ Laws that use the sampled position alone have none of that.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import xarray as xr
@@ -45,6 +45,20 @@ _PRESS_S = 1.2
 CAPS = (0.5, 0.8, 1.0)
 DRAWS = 144
 _ASKED, _DRAWN_SPEEDS = (30.0, 5000.0), (0.2, 2.0)
+#: Other benches: what is different, by axes, and the strikes that are drawn.
+BENCHES: dict[str, dict[str, Sequence[float | str]]] = {
+    "as above": {},
+    "torque on reception, $D = 0.4$": {"delay": (0.4,)},
+    "two cycles to the torque, $D = 2$": {"delay": (2.0,)},
+    "10 000 counts": {"counts": (10_000,)},
+    "32 768 counts (15 bits)": {"counts": (32_768,)},
+    "1 048 576 counts (20 bits)": {"counts": (1_048_576,)},
+    "500 Hz": {"rate": (500.0,)},
+    "2 kHz": {"rate": (2000.0,)},
+    "rotor a quarter as heavy": {"simulation.inertia_kg_m2": (2.5e-5,)},
+    "rotor four times as heavy": {"simulation.inertia_kg_m2": (4e-4,)},
+}
+_BENCH_DRAWS = 24
 #: First strikes: the wall [N·m/rad], the speeds of approach [rad/s], and the phases.
 _FIRST_STIFFNESS = 200.0
 _FIRST_SPEEDS = (0.3, 0.5, 0.7, 1.0)
@@ -69,6 +83,7 @@ class LawTable:
         write: Writes the result as Markdown, line by line.
         draws: Number of strikes with stiffness, speed and phase drawn at random; 0: those of the
             axes.
+        benches: Axes with one value that make other benches, by name; with draws only.
     """
 
     title: str
@@ -78,6 +93,7 @@ class LawTable:
     capped: bool
     write: Callable[[xr.Dataset], Iterator[str]]
     draws: int = 0
+    benches: Mapping[str, dict[str, Sequence[float | str]]] = field(default_factory=dict)
 
 
 def compute_law_table(
@@ -105,8 +121,8 @@ def compute_law_table(
 
     Returns:
         The measures that the table shows, with a dimension per axis, or in place of stiffness,
-        speed and phase the dimension `strike`. K-limits are at the best of DAMPINGS, which is the
-        coordinate `damping_normalised`.
+        speed and phase the dimension `strike`; of several benches, with the dimension `bench`.
+        K-limits are at the best of DAMPINGS, which is the coordinate `damping_normalised`.
 
     Raises:
         InputError: For a table, a law or an operator that does not exist.
@@ -135,7 +151,11 @@ def compute_law_table(
     if table.searches:
         joined = xr.concat(found, "law", join="outer").sel(law=chosen)
     elif table.draws:
-        joined = xr.concat([each.squeeze(_DRAWN) for each in found], "strike")
+        benches = [
+            xr.concat([each.squeeze(_DRAWN) for each in found[i : i + table.draws]], "strike")
+            for i in range(0, len(found), table.draws)
+        ]
+        joined = _joined_benches(table, benches) if table.benches else benches[0]
     return joined.assign_attrs(found[0].attrs | {"title": table.title, "table": name})
 
 
@@ -163,9 +183,13 @@ def _make_plans(
         base = base.model_copy(update={"wall": base.wall.model_copy(update={"cap": None})})
     if table.draws:
         strikes = list(drawn_strikes(table.draws))
-        # Checked once: the conditions of all are the same.
-        plan = make_plan(base, {"law": laws, **shared, **strikes[0]}, through)
-        return [_struck_otherwise(plan, strike) for strike in strikes]
+        # Checked once: the conditions of all strikes are the same.
+        return [
+            _struck_otherwise(plan, strike)
+            for bench in table.benches.values() or [{}]
+            for plan in [make_plan(base, {"law": laws, **shared, **bench, **strikes[0]}, through)]
+            for strike in strikes
+        ]
     if not table.searches:
         return [make_plan(base, {"law": laws, **shared}, through)]
     plain = {"damping_ratio": None, "damping_nm_s_per_rad": 0.0}
@@ -191,6 +215,14 @@ def _make_plans(
 def _struck_otherwise(plan: Plan, strike: Mapping[str, float]) -> Plan:
     axes = {name: SweepAxis(name, (strike[name],)) for name in _DRAWN}
     return replace(plan, stiffness=axes["stiffness"], speed=axes["speed"], phase=axes["phase"])
+
+
+def _joined_benches(table: LawTable, found: Sequence[xr.Dataset]) -> xr.Dataset:
+    alike = [
+        each.squeeze(list(axes), drop=True)
+        for each, axes in zip(found, table.benches.values(), strict=True)
+    ]
+    return xr.concat(alike, "bench").assign_coords(bench=list(table.benches))
 
 
 def drawn_strikes(count: int) -> Iterator[dict[str, float]]:
@@ -327,6 +359,23 @@ def _write_cap(dataset: xr.Dataset) -> Iterator[str]:
                 yield _row(f"first strike: {name}", cells)
 
 
+def _write_benches(dataset: xr.Dataset) -> Iterator[str]:
+    """Yield failed strikes, and the median of the stiffness in force over min(K, m/T²)."""
+    operators = _names(dataset, "operator")
+    yield from _head([*operators, "failed", "of"])
+    for name in _names(dataset, "bench"):
+        bench = dataset.sel(bench=name)
+        most = np.minimum(bench["stiffness"], bench["inertia"] / bench["period"] ** 2)
+        share = bench["stiffness_in_force"] / most
+        cells = []
+        for operator in operators:
+            failed = bench["chatters"].sel(operator=operator)
+            median = _quantile(share.sel(operator=operator), 0.5)
+            cells.append(f"{100.0 * failed.values.mean():.1f} %; {median}")
+        everyone = bench["chatters"].values
+        yield _row(name, [*cells, f"**{100.0 * everyone.mean():.1f} %**", str(everyone.size)])
+
+
 def _write_first_strikes(dataset: xr.Dataset) -> Iterator[str]:
     """Yield depth and exit of the first strikes of each law."""
     yield from _head(_names(dataset, "operator"))
@@ -386,6 +435,16 @@ LAW_TABLES = {
         True,
         _write_cap,
         DRAWS,
+    ),
+    "bench": LawTable(
+        "Walls with the configuration's cap on other benches",
+        (),
+        _SERVOS_AND_FRICTIONS | {"delay_error": DELAY_ERRORS},
+        False,
+        True,
+        _write_benches,
+        _BENCH_DRAWS,
+        BENCHES,
     ),
     "first-strike": LawTable(
         "First strike of an unknown hand",

@@ -17,7 +17,7 @@ from canwall.walls.bank import (
     take_over,
     with_probe,
 )
-from canwall.walls.bank_gains import hand_damping, lightest_bandwidth
+from canwall.walls.bank_gains import hand_damping, lightest_bandwidth, stiffest_walls
 from canwall.walls.estimator import (
     ESTIMATOR,
     MAX_DELAY,
@@ -116,6 +116,7 @@ __all__ = [
     "start_open_loop",
     "stiffest",
     "stiffest_wall",
+    "stiffest_walls",
     "take_over",
     "wall_force",
     "with_probe",

@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
-from canwall.walls.bank_gains import PACES, QUICKER, SHORTEST_DELAY, STEADIEST, set_filters
+from canwall.walls.bank_gains import (
+    PACES,
+    QUICKER,
+    SHORTEST_DELAY,
+    STEADIEST,
+    set_filters,
+    stiffest_walls,
+)
 from canwall.walls.estimator import MAX_DELAY, set_model, set_model_delay
 from canwall.walls.regression import (
     HAND_RATE,
@@ -107,7 +114,7 @@ BANK = np.dtype(
         ("transition", "f8", (MAX_FILTERS, 3, 3)),
         ("scale", "f8", (MAX_FILTERS, 3)),
         ("force_noise", "f8", (MAX_FILTERS,)),
-        # The stiffest wall on an elastic shaft.
+        # The stiffest wall that shaft, delay and encoder bear.
         ("stiffest", "f8", (MAX_FILTERS,)),
         ("regression", REGRESSION, (1,)),
         # Place of the mass in force on the scale of the filters' numbers.
@@ -125,19 +132,19 @@ BANK = np.dtype(
 _FORGOTTEN_S = 0.2
 #: Share of the way to the likeliest mass that is gone in a period.
 _FOLLOWED = 0.6
-#: Least way of a handle that moves [counts a sample], and the time after it for which all filters
-#: are as quick as the lightest [s]: noise is felt at rest alone, and a filter that is slow to find
-#: the push after a blow makes a heavy hand bounce.
-_MOVES, _LIVELY_S = 6.0, 0.2
+#: Least speed of a handle that moves [rad/s], and the time after it for which filters are as quick
+#: as they may be [s]: noise is felt at rest alone, and a filter that is slow to find the push after
+#: a blow makes a heavy hand bounce.
+_MOVES, _LIVELY_S = 0.28, 0.2
 #: Time without torque but a probe's after which a handle that moves flies, and time constant with
 #: which the trend of the push is forgotten in contact [s]: what a blow and the push after it do to
 #: an estimate is no trend.
 _FLIGHT_S, _TREND_S = 0.04, 0.0028
 #: Time after a flight in which a hand begins to press [s], the sample under the wall's torque from
-#: which on it does, and the longest way of one that tells how its push changes [counts]. Earlier
+#: which on it does, and the largest speed at which one tells how its push changes [rad/s]. Earlier
 #: and faster it is a blow, whose errors are those of delay and mass; later, with friction, the
 #: trend would make the handle hunt.
-_LANDING_S, _PRESSED, _SLOW_WAY = 0.04, 4, 8.0
+_LANDING_S, _PRESSED, _SLOW = 0.04, 4, 0.38
 #: Most equal samples from which on a velocity is bounded by them: a filter that is slower than that
 #: finds rest by itself.
 _EQUAL_SAMPLES = 32.0
@@ -165,6 +172,7 @@ def set_bank(
     delay: float,
     shaft: ElasticShaft | None = None,
     margin: float = 0.0,
+    radius: float = 0.08,
 ) -> None:
     """Write the filters into a BANK array (1,).
 
@@ -176,10 +184,11 @@ def set_bank(
         period: T [s].
         count: One count of the encoder [rad].
         force_walk: See `kalman_model`; that of the lightest, and on an elastic shaft of all.
-            The others are as quick as the lightest, from 3 times its mass on slower.
+            The others are as quick as the lightest, or slower, as the encoder is felt.
         delay: D in periods; its fraction counts.
         shaft: What joins rotor and handle. Default: they are one.
         margin: Part of the delay that the filters alone have, not the regression. In periods.
+        radius: Radius of the handle, at which the steps of the encoder are felt [m].
     """
     n = len(masses)
     if not 3 <= n <= MAX_FILTERS:
@@ -198,7 +207,10 @@ def set_bank(
     bank["gain_in_flight"] = bank["trend_gain"] = 0.0
     bank["steadiest"] = STEADIEST * masses[-1] / period**2
     bank["viscous"][0, :n] = viscous
-    set_filters(bank[0], masses, spring, period, count, force_walk, rigid=shaft is None)
+    rigid = shaft is None
+    if rigid:
+        bank["stiffest"][0, :n] = stiffest_walls(masses, delay, period, count, radius)
+    set_filters(bank[0], masses, spring, period, count, force_walk, radius, rigid)
 
 
 def reset_bank(bank: NDArray[np.void], y: float) -> None:
@@ -235,7 +247,7 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
         begin_regression(bank.regression[0], y_sample, estimator.in_flight[estimator.delay_periods])
         return False
     _note_flight(bank, estimator)
-    slow = _SLOW_WAY * bank.regression[0].resolution
+    slow = _SLOW * bank.regression[0].period + bank.regression[0].resolution
     follows = bank.presses and abs(y_sample - bank.sampled) <= slow
     for i in range(n):
         residual = y_sample - state[0, i]
@@ -303,7 +315,7 @@ def _follow_trend(bank: Record, i: int, correction: float) -> None:
 def set_pace(bank: Record, stiffness: float) -> None:
     """Make the filters as quick as handle and stiffness want; call before `correct_bank`."""
     regression = bank.regression[0]
-    if abs(regression.way) >= _MOVES * regression.resolution:
+    if abs(regression.way) >= _MOVES * regression.period:
         bank.lively_left = bank.lively
     elif bank.lively_left > 0:
         bank.lively_left -= 1
@@ -461,7 +473,7 @@ def _place_of(bank: Record, likeliest: float) -> float:
 
 @compiled
 def stiffest(bank: Record) -> float:
-    """Return the stiffness of the stiffest wall on an elastic shaft, with the mass in force."""
+    """Return the stiffness of the stiffest wall, with the mass in force."""
     k = min(int(bank.place), bank.count - 2)
     share = bank.place - k
     return bank.stiffest[k] + share * (bank.stiffest[k + 1] - bank.stiffest[k])

@@ -1,9 +1,12 @@
 """Bandwidths of the filters of a bank: their gains and models, made outside the cycle.
 
 A filter has a bandwidth for walls of each stiffness and one for a handle that moves; it goes with
-that of the delay. Those of light hands have one more for the way to the wall. What the steps of the
-encoder make felt grows with mass and bandwidth; a filter that is too slow for wall and hand makes
-them bounce, and one that is too quick for friction swings.
+that of the delay. Those of light hands have one more for the way to the wall. A filter that is too
+slow for wall and hand makes them bounce, and one that is too quick for friction swings.
+
+What the steps of the encoder make felt grows with the bandwidth, and with the force at the handle
+that moves the mass by a count in a period, m·Δ/(T²·r): the count force of a hand. It decides which
+filter may be as quick as the delay allows, whatever encoder, period and rotor are.
 """
 
 import math
@@ -12,22 +15,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.physics import zoh
-from canwall.walls.estimator import KalmanModel, gain_with_trend, kalman_model
+from canwall.walls.estimator import KalmanModel, bandwidth_of, gain_with_trend, kalman_model
 
 #: Stiffnesses for which filters have gains, each half of the one before; after these, gains for a
 #: handle that moves.
 PACES = 8
 #: Bandwidths relative to that for the delay as told, for which filters have gains.
 QUICKER = (0.75, 1.0, 1.4)
-#: Shortest delay that makes filters quicker [periods].
-SHORTEST_DELAY = 0.5
+#: Shortest delay that makes filters quicker [periods]. A torque that acts on reception would allow
+#: more; but the steps of the encoder would be felt, and friction swing.
+SHORTEST_DELAY = 1.45
 #: Bandwidth of the filter of the lightest hand, over that of one which follows within the delay.
 _QUICKNESS = 0.85
-#: Mass over the lightest one up to which all filters have one bandwidth, and the power of the mass
-#: with which that of heavier ones falls. What the steps of the encoder make felt at the handle
-#: grows with mass and bandwidth; but under a filter that is slow against the wall a handle that
+#: Bandwidth of the filter of a hand with this count force, in 1/T and N, and the power of the force
+#: with which that of others falls. Under a filter that is slow against the wall a handle that
 #: breaks loose slips far, and friction and the bias force hunt.
-_AS_QUICK, _STEADINESS = 3.0, 0.52
+_STEADY, _COUNT_FORCE_N, _STEADINESS = 0.54, 0.18, 0.52
+#: Count force up to which the filters of a handle that moves are as quick as the lightest [N].
+_LIVELY_N = 2.2
 #: K·T²/m from which on a filter is at its steadiest, and the power of the stiffness with which its
 #: bandwidth rises below, up to the lightest one's, and for walls softer by a factor no further: on
 #: a soft wall noise is felt less, and a filter slower than the wall makes a heavy hand bounce.
@@ -37,9 +42,9 @@ STEADIEST, _QUICKENING, _SOFTEST = 1.0, 1.0 / 6.0, 16.0
 #: smaller the motion: a loop that some damping makes unstable goes on swinging in friction, as that
 #: of a quick filter does with a mass that has little damping of its own.
 _CALM, _CALM_UP_TO = 0.75, 1.25
-#: Bandwidth of the filters that follow how the push of a light hand changes on its way to the wall,
-#: over that of the lightest one in contact.
-_IN_FLIGHT = 0.9
+#: Mass over the lightest one up to which filters follow how the push changes, and their bandwidth
+#: on the way to the wall, over that of the lightest one in contact.
+_LIGHT, _IN_FLIGHT = 3.0, 0.9
 #: How quickly they follow it in contact, as a part of how quickly they do in flight.
 _IN_CONTACT = 0.3
 #: Share of half a count within which a reading does not contradict the prediction of a heavy hand,
@@ -51,6 +56,11 @@ _WITHIN = 0.8
 _EQUAL = 8.0
 #: Time constant at which a light hand's damping equals its inertia [s].
 _HAND_S = 1.5e-3
+#: K·T²/m of the stiffest wall, the delay from which on it falls [periods], and the power of the
+#: delay with which it does: beyond, light hands bounce, and hunt in friction.
+_STIFFEST, _LONG_DELAY, _SOFTENING = 0.83, 1.7, 4.0
+#: Most that a count may change the force of a wall at the handle [N].
+_STEP_N = 2.0
 
 
 def hand_damping(inertia: float, most: float) -> float:
@@ -59,6 +69,25 @@ def hand_damping(inertia: float, most: float) -> float:
     Fingers of a few grams have some newton seconds per metre, a grip and an arm hardly more.
     """
     return most * inertia / (inertia + most * _HAND_S)
+
+
+def stiffest_walls(
+    masses: NDArray[np.float64], delay: float, period: float, count: float, radius: float
+) -> NDArray[np.float64]:
+    """Return the stiffness of the stiffest wall of each hand that delay and encoder bear.
+
+    Args:
+        masses: Masses at the handle, shape (n,).
+        delay: D in periods.
+        period: T [s].
+        count: One count of the encoder [rad].
+        radius: Radius of the handle [m].
+
+    Returns:
+        Stiffnesses [N·m/rad], shape (n,).
+    """
+    within_delay = _STIFFEST * (_LONG_DELAY / max(delay, SHORTEST_DELAY)) ** _SOFTENING
+    return np.minimum(within_delay * masses / period**2, _STEP_N * radius / abs(count))
 
 
 def lightest_bandwidth(delay: float, period: float) -> float:
@@ -73,6 +102,7 @@ def set_filters(
     period: float,
     count: float,
     force_walk: float,
+    radius: float,
     rigid: bool,
 ) -> None:
     """Write the filters of a bank whose masses, dampings and delay are set.
@@ -84,21 +114,26 @@ def set_filters(
         period: T [s].
         count: One count of the encoder [rad].
         force_walk: As for `set_bank`.
+        radius: As for `set_bank`.
         rigid: False on an elastic shaft: one walk for all, whatever wall and delay are.
     """
+    lightest = bandwidth_of(force_walk, float(masses[0]), period, count) * period
     for i in range(len(masses)):
         plant = float(masses[i]), bank["viscous"][i].item(), spring, period
-        walk, heavier, slower = force_walk, float(masses[i] / masses[0]), 1.0
+        walk, heavier, slower, lively = force_walk, float(masses[i] / masses[0]), 1.0, 1.0
         if rigid:
-            light = min(1.0, _AS_QUICK / heavier)
+            count_force = plant[0] * abs(count) / (period**2 * radius)
+            felt_less = _COUNT_FORCE_N / count_force
             calm = min((heavier - 1.0) / (_CALM_UP_TO - 1.0), 1.0)
-            slower = light**_STEADINESS * (_CALM + (1.0 - _CALM) * calm)
+            calm = _CALM + (1.0 - _CALM) * calm
+            slower = min(calm, _STEADY / lightest * felt_less**_STEADINESS)
+            lively = max(min(1.0, _LIVELY_N / count_force) ** _STEADINESS, slower)
             walk *= heavier * slower**3  # by the cube of the bandwidth
-            bank["within"][i] = 0.5 * _WITHIN * (1.0 - light) * abs(count)
+            bank["within"][i] = 0.5 * _WITHIN * max(1.0 - felt_less, 0.0) * abs(count)
         _set_filter(bank, i, kalman_model(*plant, count, walk))
-        _set_paces(bank, i, plant, count, walk, slower, rigid)
+        _set_paces(bank, i, plant, count, walk, slower, lively, rigid)
         _set_torques(bank, i, *plant)
-        if rigid and heavier <= _AS_QUICK:
+        if rigid and heavier <= _LIGHT:
             in_flight = _IN_FLIGHT * lightest_bandwidth(bank["told"].item(), period)
             bank["gain_in_flight"][:, i] = gain = gain_with_trend(*plant, in_flight)
             bank["trend_gain"][i] = _IN_CONTACT * gain[3] / gain[2]
@@ -111,29 +146,35 @@ def _set_paces(
     count: float,
     walk: float,
     slower: float,
+    lively: float,
     rigid: bool,
 ) -> None:
     """Write the gains of a filter and what rest tells it.
 
-    Its bandwidth goes with that of the delay, and up to being as quick as the lightest.
+    Its bandwidth goes with that of the delay. slower, lively: for the stiffest wall, and for a
+    handle that moves, over that of the lightest.
     """
     period = plant[-1]
     paces = np.zeros((len(QUICKER), PACES + 1, 6))
-    shares = np.array(_shares(bank, i, slower))[:, None]
+    faster = lively / slower
+    shares = np.array(_shares(bank, i, faster))[:, None]
     for k, quicker in enumerate(QUICKER if rigid else [1.0] * len(QUICKER)):
         steady = _gain_and_rest(kalman_model(*plant, count, walk * quicker**3), period)
-        quick = _gain_and_rest(kalman_model(*plant, count, walk * (quicker / slower) ** 3), period)
+        quick = _gain_and_rest(kalman_model(*plant, count, walk * (quicker * faster) ** 3), period)
         paces[k] = steady * (quick / steady) ** shares
     bank["paces"][:, :, :, i] = _parabolas(np.array(QUICKER), paces)
 
 
-def _shares(bank: np.void, i: int, slower: float) -> list[float]:
-    """Return the share of the way from a filter's steadiest gains to its quickest, by pace."""
-    if slower == 1.0:
+def _shares(bank: np.void, i: int, faster: float) -> list[float]:
+    """Return the share of the way from a filter's steadiest gains to its quickest, by pace.
+
+    faster: bandwidth of the quickest over that of the steadiest.
+    """
+    if faster == 1.0:
         return [0.0] * (PACES + 1)
     steadiest = math.exp(bank["log_step"] * (i + 1 - bank["count"]))
     softer = [min(max(steadiest * 2.0**k, 1.0), _SOFTEST) for k in range(PACES)]
-    shares = [_QUICKENING * math.log(each) / -math.log(slower) for each in softer]
+    shares = [_QUICKENING * math.log(each) / math.log(faster) for each in softer]
     return [*(min(share, 1.0) for share in shares), 1.0]
 
 

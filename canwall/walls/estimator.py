@@ -103,7 +103,7 @@ def kalman_model(
     a[:2, 2] = gamma
     # In units of the count, and of the velocity and the force that go with it at the filter's
     # bandwidth, the covariances are of one order, and the Riccati solver keeps its digits.
-    omega = (12.0 * force_walk**2 / (mass * mass * count * count * period)) ** (1.0 / 6.0)
+    omega = bandwidth_of(force_walk, mass, period, count)
     scale = np.array([count, count * omega, count * mass * omega * omega])
     a = a * scale[None, :] / scale[:, None]
     force_noise = period * (force_walk / scale[2]) ** 2
@@ -153,6 +153,12 @@ def force_walk_of(bandwidth: float, mass: float, period: float, count: float) ->
     See `kalman_model`, of which it is the inverse for a pure mass.
     """
     return bandwidth**3 * mass * count * math.sqrt(_QUANTISATION * period)
+
+
+def bandwidth_of(force_walk: float, mass: float, period: float, count: float) -> float:
+    """Return the bandwidth [rad/s] of the filter with this walk of a force [N·m/√s]."""
+    variance = _QUANTISATION * mass * mass * count * count * period
+    return float((force_walk**2 / variance) ** (1.0 / 6.0))
 
 
 def set_estimator(

@@ -66,7 +66,8 @@ WALL = np.dtype(
         # By how much larger ζ is in force, relatively, as long as mass or delay are in doubt.
         ("doubt", "f8"),
         ("cap", "f8"),
-        # Where there is a cap: the largest stiffness on an elastic shaft with the mass in force.
+        # Where there is a cap: the largest stiffness that shaft, delay and encoder bear with the
+        # mass in force.
         ("stiffest", "f8"),
         # The law's options, in the order in which its file declares them.
         ("option_values", "f8", (MAX_OPTIONS,)),

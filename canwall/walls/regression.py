@@ -28,8 +28,8 @@ from canwall.walls.estimator import MAX_DELAY, unit_motion
 from canwall.walls.shaft import ElasticShaft
 from canwall.walls.swing import SWING, end_swing, follow_swing, lightness_of_swing, set_swing
 
-#: Number of samples that are kept: two differences give the velocity to come.
-_RECENT = 3
+#: Most samples over which a way is measured, on a coarse encoder.
+_RECENT = 8
 
 #: A regression.
 REGRESSION = np.dtype(
@@ -66,8 +66,10 @@ REGRESSION = np.dtype(
         ("hand_torque", "f8"),  # surprise by a torque that changes as fast as a hand's
         ("hand_change", "f8"),  # by how much that surprise changes until the next sample
         ("samples", "f8", (_RECENT,)),  # the last ones, newest first [rad]
-        ("way", "f8"),  # to the last sample [rad]
+        ("way", "f8"),  # of a sample, the mean of the last ones [rad]
+        ("way_samples", "i8"),  # their number
         ("steady", "i8"),  # samples since the handle stuck, or turned on an elastic shaft
+        ("moving", "i8"),  # their number from which on the handle moves
         ("probe", "f8"),  # torque before a contact for the lightest hand [N·m]
         ("stronger", "f8"),  # that of the present probe, as a multiple of it
         ("probe_samples", "i8"),  # half its period
@@ -84,11 +86,15 @@ _OBSERVER_HZ, _OBSERVER_BEHIND_SHAFT_HZ = 100.0, 50.0
 #: Noise of its surprise by the steps of the encoder [counts], and share of the noise that is
 #: exchanged with a sample: drives latch their position at ticks of their own.
 _QUANTISATION, _NOISE_SHARE = 0.5, 1.0 / 16.0
-#: Samples after which the bias has followed a handle that broke loose, and the least way of each,
-#: or of its neighbour where the handle turns [counts], and that of a handle that has been calm: one
-#: that sticks is as heavy as the world. An elastic shaft hides its turns: there the way goes on in
-#: one direction.
-_STEADY, _LEAST_WAY, _CALM_LEAST_WAY = 6, 1.5, 0.9
+#: Time after which the bias has followed a handle that broke loose, and its least samples.
+_STEADY_S, _STEADY = 0.006, 6
+#: Least way of each of them, or of its neighbour where the handle turns [counts], and that of a
+#: handle that has been calm: one that sticks is as heavy as the world. An elastic shaft hides its
+#: turns: there the way goes on in one direction.
+_LEAST_WAY, _CALM_LEAST_WAY = 1.5, 0.9
+#: Speed that is told from rest [rad/s]: where it makes less than the least way in a sample, the way
+#: is that of several.
+_TOLD_FROM_REST = 0.072
 #: Fastest change of a hand's force, and that of a hand which has been calm [N·m/s]. A torque that
 #: changes no faster may be its answer to the hand, and then says nothing of the mass: a wall that
 #: gives way to none looks heavy. With a calm hand the slower one holds where the torque rises: one
@@ -120,9 +126,9 @@ _PRIOR_EXCESS, _MOST_EXCESS, _EXCESS_CHANGES = 0.3, 0.5, 0.05
 #: Coulomb friction that there may be: standard deviation, and the most that explains a surprise
 #: [N·m].
 _FRICTION = 0.02
-#: Time before a contact from which on the handle is probed [s], and half the period of the probe
-#: [samples]: as slow as the observer lets through.
-_PROBE_S, _PROBE_SAMPLES = 0.06, 4
+#: Time before a contact from which on the handle is probed, half the period of the probe, as slow
+#: as the observer lets through [s], and its least samples.
+_PROBE_S, _PROBE_HALF_S, _PROBE_SAMPLES = 0.06, 0.004, 2
 #: Motion of a hand under the probe, from end to end [counts], and the strongest torque of a probe
 #: for any but the lightest one [N·m].
 _PROBE_COUNTS, _STRONGEST_PROBE = 4.0, 0.04
@@ -161,8 +167,13 @@ def set_regression(
     regression["hand_torque"] = HAND_RATE * period / gain[2]
     walk = 0.0 if shaft else _HAND_RATE_WALK
     regression["hand_change"] = walk * math.sqrt(period) * period / gain[2]
+    least_way = _LEAST_WAY * abs(count)
+    regression["way_samples"] = min(max(round(least_way / (_TOLD_FROM_REST * period)), 1), _RECENT)
+    regression["moving"] = max(round(_STEADY_S / period), _STEADY)
     slower = round(_OBSERVER_HZ / bandwidth)
-    regression["probe_samples"] = samples = slower * _PROBE_SAMPLES
+    regression["probe_samples"] = samples = slower * max(
+        round(_PROBE_HALF_S / period), _PROBE_SAMPLES
+    )
     quarter = 0.5 * samples * period
     regression["probe"] = slower * _PROBE_COUNTS * abs(count) * lightest / quarter**2
 
@@ -195,7 +206,7 @@ def reset_regression(regression: np.void, y: float) -> None:
 @compiled
 def moves(regression: Record) -> bool:
     """Return True if the handle has moved for a while, by more than the steps of the encoder."""
-    return regression.steady >= _STEADY
+    return regression.steady >= regression.moving
 
 
 @compiled
@@ -354,8 +365,9 @@ def _is_explained(regression: Record, steps: float) -> bool:
 
 @compiled
 def _note_way(regression: Record, y_sample: float, explained: bool, least_way: float) -> None:
-    way = y_sample - regression.samples[0]
-    least = least_way * regression.resolution
+    n = regression.way_samples
+    way = (y_sample - regression.samples[n - 1]) / n
+    least = least_way * regression.resolution / n
     if regression.rotor > 0.0:
         goes_on = abs(way) >= least and way * regression.way >= 0.0
     else:
@@ -560,7 +572,7 @@ def probe(regression: Record, wall: Record, mass: float, known: bool) -> float:
     To be called while the wall gives no force. mass: the one in force. known: True if it was found
     with little doubt; of a stranger that comes fast there is little time to learn.
     """
-    comes = -regression.way >= _LEAST_WAY * regression.resolution
+    comes = -regression.way * regression.way_samples >= _LEAST_WAY * regression.resolution
     if not (comes and 0.0 < wall.y <= -wall.v * _PROBE_S):
         regression.probed = 0
         return 0.0

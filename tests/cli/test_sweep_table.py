@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,6 +42,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     axes = {
         "laws": {"servo": ["1600Hz"], "friction": [0.02], "delay_error": [-0.3, 0.0]},
         "cap": {"servo": ["800Hz"], "friction": [0.0], "delay_error": [0.0]},
+        "bench": {"servo": ["800Hz"], "friction": [0.0], "delay_error": [0.0]},
         "first-strike": {"servo": ["1600Hz"], "friction": [0.02]},
         "shaft": {"simulation.shaft_hz": [400.0]},
     }
@@ -109,6 +111,36 @@ def test_cap_is_what_is_in_force(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert [row[1] for row in rows if "failed" in row[0]] == ["2 of 2"] * len(law_tables.CAPS)
     least = [float(row[1]) for row in rows if "least" in row[0]]
     assert least == pytest.approx([cap / 4.2 for cap in law_tables.CAPS], rel=5e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("small")
+def test_benches_are_sweeps_with_other_axes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    benches: dict[str, Any] = {"as it is": {}, "coarse and slow": {"counts": 10_000, "rate": 500.0}}
+    few = replace(
+        LAW_TABLES["bench"],
+        benches={n: {a: (v,) for a, v in axes.items()} for n, axes in benches.items()},
+    )
+    monkeypatch.setitem(LAW_TABLES, "bench", few)
+    assert run("sweep", SERVO, "--table", "bench", "--operator", "grip") == 0
+    head, *rows = rows_of(capsys.readouterr().out)
+    assert head == ["", "grip", "failed", "of"]
+    axes: dict[str, Any] = {"law": "mean_force", "operator": "grip", "model": "drive"}
+    axes |= {"servo": "800Hz", "friction": 0.0, "press": 1.2}
+    for row, (name, more) in zip(rows, benches.items(), strict=True):
+        shares, failed = [], 0
+        for i, strike in enumerate(law_tables.drawn_strikes(2)):
+            one = sweep(
+                make_plan(config.load(SERVO), {**axes, **more, **strike}),
+                tmp_path / f"{name}{i}.nc",
+            )
+            most = min(strike["stiffness"], (1e-4 + 0.05 * 0.08**2) * more.get("rate", 1000.0) ** 2)
+            shares.append(one["stiffness_in_force"].item() / most)
+            failed += int(one["chatters"].item())
+        percent = f"{50.0 * failed:.1f} %"
+        assert row == [name, f"{percent}; {np.median(shares):.3g}", f"**{percent}**", "2"]
 
 
 def test_strikes_with_a_cap_are_spread_over_all_walls_speeds_and_phases() -> None:
@@ -185,7 +217,7 @@ def test_options_without_a_meaning_for_the_table(
 def test_unknown_table(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("sweep", "--table", "log") == 2
     assert capsys.readouterr().err == (
-        "canwall: --table log: has to be one of laws, cap, first-strike, shaft\n"
+        "canwall: --table log: has to be one of laws, cap, bench, first-strike, shaft\n"
     )
 
 

@@ -31,6 +31,7 @@ from canwall.walls import (
     set_model,
     set_pace,
     start_lagging,
+    stiffest_walls,
     take_over,
 )
 from canwall.walls.estimator import gain_with_trend
@@ -177,20 +178,32 @@ def test_delay_in_doubt_counts_for_a_heavy_hand_that_moves(mass: float, share: f
     assert doubt(bank[0]) == pytest.approx(min(0.9 + share * 0.2, 1.0))
 
 
-def walk_of(i: int, quicker: float = 1.0) -> float:
-    """Equal bandwidths, q/m, up to 3 times the lightest mass; then they fall with m^-0.52.
+def relative_bandwidths(
+    i: int, period: float = PERIOD, count: float = COUNT, radius: float = 0.08
+) -> tuple[float, float]:
+    """Return those of filter i at its steadiest and at its quickest, over that of WALK.
 
-    That of the lightest is 0.75 of the next ones'.
+    0.54/T where a count in a period takes 0.18 N, and with that force to the power of -0.52; but no
+    quicker than that of WALK, and for the lightest hand at rest 0.75 of it.
     """
-    heavier = MASSES[i] / MASSES[0]
-    slower: float = max(1.0, heavier / 3.0) ** -0.52 * (0.75 if i == 0 else 1.0)
-    return WALK * float(heavier) * (slower * quicker) ** 3
+    lightest = (12.0 * WALK**2 / (MASSES[0] * count) ** 2 / period) ** (1.0 / 6.0)
+    force = MASSES[i] * count / period**2 / radius
+    slower = min(0.75 if i == 0 else 1.0, 0.54 / (lightest * period) * (0.18 / force) ** 0.52)
+    return slower, max(min(1.0, (2.2 / force) ** 0.52), slower)
 
 
-def gain_of(i: int, quicker: float) -> NDArray[np.float64]:
+def walk_of(i: int, quicker: float = 1.0) -> float:
+    slower, _ = relative_bandwidths(i)
+    return WALK * float(MASSES[i] / MASSES[0]) * (slower * quicker) ** 3
+
+
+def gain_of(
+    i: int, quicker: float, period: float = PERIOD, count: float = COUNT, radius: float = 0.08
+) -> NDArray[np.float64]:
     alone = np.zeros(1, ESTIMATOR)
-    walk = walk_of(i, quicker)
-    set_estimator(alone, MASSES[i], VISCOUS[i], 0.0, 0.0, PERIOD, COUNT, walk, DELAY)
+    slower, _ = relative_bandwidths(i, period, count, radius)
+    walk = WALK * float(MASSES[i] / MASSES[0]) * (slower * quicker) ** 3
+    set_estimator(alone, MASSES[i], VISCOUS[i], 0.0, 0.0, period, count, walk, DELAY)
     gain: NDArray[np.float64] = alone["steady_gain"][0]
     return gain
 
@@ -223,19 +236,62 @@ def test_filters_are_quicker_on_softer_walls() -> None:
     for softer, i in ((1.0, 15), (4.0, 15), (64.0, 15), (16.0, 9), (64.0, 2), (64.0, 0)):
         set_pace(bank[0], 0.99 * stiffest / softer)
         of_its_own = softer * MASSES[i] / MASSES[15]
-        slower = max(1.0, MASSES[i] / MASSES[0] / 3.0) ** -0.52 * (0.75 if i == 0 else 1.0)
-        quicker = min(min(max(of_its_own, 1.0), 16.0) ** (1.0 / 6.0), 1.0 / slower)
+        slower, lively = relative_bandwidths(i)
+        quicker = min(min(max(of_its_own, 1.0), 16.0) ** (1.0 / 6.0), lively / slower)
         np.testing.assert_allclose(bank["gain"][0, :, i], gain_of(i, quicker), rtol=0.1)
 
 
-@pytest.mark.parametrize("excess", [-0.35, -0.2, 0.1, 0.3])
-def test_filters_are_as_slow_as_the_delay_that_is_found(excess: float) -> None:
+@pytest.mark.parametrize(
+    ("period", "count", "radius"),
+    [
+        (PERIOD, 6.3e-4, 0.08),
+        (PERIOD, 6e-6, 0.08),
+        (2e-3, COUNT, 0.08),
+        (5e-4, COUNT, 0.08),
+        (PERIOD, COUNT, 0.03),
+    ],
+)
+def test_filters_are_as_quick_as_the_encoder_allows(
+    period: float, count: float, radius: float
+) -> None:
+    """By the force of a count in a period at the handle, whatever makes it small or large."""
+    bank = np.zeros(1, BANK)
+    set_bank(bank, MASSES, VISCOUS, 0.0, period, count, WALK, DELAY, radius=radius)
+    reset_bank(bank, 0.0)
+    set_pace(bank[0], 1e9)
+    steadiest = bank["gain"][0].copy()
+    bank["regression"]["way"] = 0.3 * period
+    set_pace(bank[0], 1e9)
+    for i in (0, 3, 8, 15):
+        slower, lively = relative_bandwidths(i, period, count, radius)
+        np.testing.assert_allclose(steadiest[:, i], gain_of(i, 1.0, period, count, radius))
+        quickest = gain_of(i, lively / slower, period, count, radius)
+        np.testing.assert_allclose(bank["gain"][0, :, i], quickest)
+
+
+def test_stiffest_walls_of_long_delays_and_coarse_encoders() -> None:
+    """0.83·m/T² up to D = 1.7 periods, with D^-4 beyond, and 2 N a count at the handle."""
+    masses = np.array([1e-4, 3.5e-3])
+    at_17 = stiffest_walls(masses, 1.7, PERIOD, 1e-9, 0.08)
+    np.testing.assert_allclose(at_17, 0.83 * masses / PERIOD**2)
+    np.testing.assert_allclose(stiffest_walls(masses, 2.55, PERIOD, 1e-9, 0.08), at_17 / 1.5**4)
+    assert np.all(stiffest_walls(masses, 1.45, PERIOD, 1e-9, 0.08) > masses / PERIOD**2)
+    coarse = stiffest_walls(masses, 1.7, PERIOD, -6.3e-4, 0.04)
+    np.testing.assert_allclose(coarse, [83.0, 2.0 * 0.04 / 6.3e-4])
+
+
+@pytest.mark.parametrize(
+    ("excess", "quicker"),
+    [(-0.35, 1.0), (-0.2, 1.0), (0.1, 1.0), (0.3, 1.45 / 1.65), (0.4, 1.45 / 1.75)],
+)
+def test_filters_are_as_slow_as_the_delay_that_is_found(excess: float, quicker: float) -> None:
+    """But no quicker than for 1.45 periods."""
     bank, estimator = bank_at(0.0)
     bank["regression"]["excess"] = excess
     correct_bank(bank[0], estimator[0], 0.0)
     set_pace(bank[0], 1e9)
     for i in (0, 3, 12):
-        expected = gain_of(i, DELAY / (DELAY + excess))
+        expected = gain_of(i, quicker)
         np.testing.assert_allclose(bank["gain"][0, :, i], expected, rtol=0.02)
 
 

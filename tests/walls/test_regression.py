@@ -16,6 +16,7 @@ from canwall.walls.regression import (
     forget_mass,
     learn,
     mean_above_zero,
+    moves,
     predict_regression,
     probe,
     reset_regression,
@@ -60,6 +61,25 @@ def play(
         a = (torque + pushed - 0.01 * v) / mass
         y, v = y + PERIOD * v + 0.5 * PERIOD**2 * a, v + PERIOD * a
     return solve(regression[0], known)
+
+
+@pytest.mark.parametrize("counts", [10_000, 32_768, 131_072])
+@pytest.mark.parametrize("rate", [500.0, 1000.0, 2000.0])
+def test_slow_motion_is_told_from_rest(counts: int, rate: float) -> None:
+    """0.13 rad/s are a fifth of a count of 10 000 in a millisecond: told by up to 8 samples."""
+    count, estimator = 2.0 * math.pi / counts, np.zeros(1, ESTIMATOR)
+    speed = max(0.13, 2.0 * count * rate / 8)
+    regression = np.zeros(1, REGRESSION)
+    set_regression(regression[0], LIGHTEST, 1.0 / rate, count, 0.0)
+    reset_regression(regression[0], 0.0)
+    moved = []
+    for j in range(400):
+        y = speed * max(j - 200, 0) / rate
+        learn(regression[0], estimator[0], count * round(y / count), LIGHTEST, False)
+        predict_regression(regression[0], estimator[0]["in_flight"], 0.0, 0.0)
+        moved.append(bool(moves(regression[0])))
+    assert not any(moved[:200])
+    assert np.mean(moved[300:]) > 0.95
 
 
 def test_observer_has_three_equal_poles() -> None:
