@@ -33,6 +33,9 @@ SWING = np.dtype(
         ("highest", "f8"),
         ("direction", "f8"),  # in which the torque changes; 0: in none up to now
         ("halves", "i8"),  # in a row that no hand makes
+        ("last", "f8"),  # the last sample [rad]
+        ("equal", "i8"),  # samples in a row up to now, and the most in the present half
+        ("stuck", "i8"),
     ],
     align=True,
 )
@@ -40,9 +43,11 @@ SWING = np.dtype(
 #: Duration of half a swing [s]: faster than a hand pushes to and fro, and no faster than what the
 #: torque tells of a blow.
 _SHORTEST_S, _LONGEST_S = 0.008, 0.042
-#: Way of a swing from end to end, and noise of what the observer does not expect [counts]. A handle
-#: that sticks does not swing.
+#: Way of a swing from end to end, and noise of what the observer does not expect [counts].
 _LEAST_WAY, _NOISE = 3.0, 0.5
+#: Share of a half that may pass without a count: a handle that sticks and slips does not swing, and
+#: looks heavy while it sticks.
+_STUCK = 0.7
 #: Halves in a row that are no hand's.
 _HALVES = 2
 
@@ -83,6 +88,9 @@ def follow_swing(swing: Record, y: float, position: float, torque: float, turns_
     if half.samples == 0:
         half.rr = half.rt = half.tt = 0.0
         swing.lowest = swing.highest = y
+        swing.stuck = swing.equal = 0
+    swing.equal = swing.equal + 1 if y == swing.last else 0
+    swing.stuck, swing.last = max(swing.stuck, swing.equal), y
     half.rr += position * position
     half.rt += position * torque
     half.tt += torque * torque
@@ -92,6 +100,7 @@ def follow_swing(swing: Record, y: float, position: float, torque: float, turns_
         return False
     swings = swing.direction != 0.0 and half.samples >= swing.shortest
     swings = swings and swing.highest - swing.lowest >= swing.least_way
+    swings = swings and swing.stuck <= _STUCK * half.samples
     swing.halves = swing.halves + 1 if swings else 0
     swing.direction = torque
     both = swing.both[0]

@@ -60,6 +60,22 @@ def test_what_is_no_swing_tells_nothing(hz: float, counts: float) -> None:
     assert first_told(hz, 1e-3, counts)[0] == -1
 
 
+@pytest.mark.parametrize(("slips", "told"), [(1, False), (2, False), (12, True)])
+def test_handle_that_sticks_and_slips_does_not_swing(slips: int, told: bool) -> None:
+    """It goes four counts within that many of the 20 samples of a half."""
+    swing = np.zeros(1, SWING)
+    set_swing(swing[0], PERIOD, COUNT)
+    end_swing(swing[0])
+    found = False
+    for j in range(200):
+        torque = 1e-7 * np.sin(np.pi * (j + 0.5) / 20)
+        since = max(j % 20 - 1, 0)
+        there = min(since, slips) * 4 // slips
+        y = COUNT * (there if j // 20 % 2 else 4 - there)
+        found |= follow_swing(swing[0], y, 0.0, torque, TURNS_AT)
+    assert found == told
+
+
 def test_pause_ends_a_swing() -> None:
     swing = np.zeros(1, SWING)
     set_swing(swing[0], PERIOD, COUNT)
