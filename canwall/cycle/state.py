@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from canwall.analysis.felt import HANDLE_RADIUS_M
 from canwall.analysis.metrics import STRIKE_GAP_S
-from canwall.config import Guard, Limits, Operator, Settings, Wall
+from canwall.config import ConfigError, Guard, Limits, Operator, Settings, Wall
 from canwall.cycle.guard import GUARD, change_guard, set_guard
 from canwall.drive import DriveSetup, PdoLayout
 from canwall.drive import objects as od
@@ -233,14 +233,21 @@ def _model(settings: Settings) -> tuple[float, float, float]:
 def modelled_delay(settings: Settings) -> float:
     """Return D as configured, with the drive's own cycle and current loop added [periods].
 
-    A first-order lag counts as its time constant (theory, section 8).
+    A first-order lag counts as its time constant (theory, section 8). Raises ConfigError for a
+    delay of more than MAX_DELAY.
     """
     drive, delay = settings.drive, settings.estimator.delay_cycles
     lag_s = 0.0
     if drive.current_bandwidth_hz:
         lag_s = 1.0 / (2.0 * math.pi * drive.current_bandwidth_hz)
     bus = SYNCHRONOUS_DELAY if delay is None else delay
-    return bus + (drive.drive_cycle_s + lag_s) / settings.bus.cycle_s
+    delay = bus + (drive.drive_cycle_s + lag_s) / settings.bus.cycle_s
+    if delay > MAX_DELAY:
+        raise ConfigError(
+            f"bus.cycle_s: with drive.drive_cycle_s and drive.current_bandwidth_hz a torque acts "
+            f"{delay:.3g} cycles after its sample, {MAX_DELAY} at most: has to be longer"
+        )
+    return delay
 
 
 def _hands(settings: Settings) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -58,7 +58,7 @@ _EQUAL = 8.0
 _HAND_S = 1.5e-3
 #: K·T²/m of the stiffest wall, the delay from which on it falls [periods], and the power of the
 #: delay with which it does: beyond, light hands bounce, and hunt in friction.
-_STIFFEST, _LONG_DELAY, _SOFTENING = 0.83, 1.7, 4.0
+_STIFFEST, _LONG_DELAY, _SOFTENING = 0.83, 1.85, 5.0
 #: Most that a count may change the force of a wall at the handle [N].
 _STEP_N = 2.0
 

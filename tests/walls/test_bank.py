@@ -10,6 +10,7 @@ from rig import settings_with
 from scipy.linalg import expm, solve_discrete_are
 from scipy.signal import cont2discrete
 
+from canwall.config import ConfigError
 from canwall.cycle.state import modelled_delay
 from canwall.walls import (
     BANK,
@@ -270,13 +271,14 @@ def test_filters_are_as_quick_as_the_encoder_allows(
 
 
 def test_stiffest_walls_of_long_delays_and_coarse_encoders() -> None:
-    """0.83·m/T² up to D = 1.7 periods, with D^-4 beyond, and 2 N a count at the handle."""
+    """0.83·m/T² at D = 1.85 periods, with D^-5 beyond, and 2 N a count at the handle."""
     masses = np.array([1e-4, 3.5e-3])
-    at_17 = stiffest_walls(masses, 1.7, PERIOD, 1e-9, 0.08)
-    np.testing.assert_allclose(at_17, 0.83 * masses / PERIOD**2)
-    np.testing.assert_allclose(stiffest_walls(masses, 2.55, PERIOD, 1e-9, 0.08), at_17 / 1.5**4)
-    assert np.all(stiffest_walls(masses, 1.45, PERIOD, 1e-9, 0.08) > masses / PERIOD**2)
-    coarse = stiffest_walls(masses, 1.7, PERIOD, -6.3e-4, 0.04)
+    at_185 = stiffest_walls(masses, 1.85, PERIOD, 1e-9, 0.08)
+    np.testing.assert_allclose(at_185, 0.83 * masses / PERIOD**2)
+    twice = stiffest_walls(masses, 3.7, PERIOD, 1e-9, 0.08)
+    np.testing.assert_allclose(twice, at_185 / 2.0**5)
+    assert np.all(stiffest_walls(masses, 1.7, PERIOD, 1e-9, 0.08) > masses / PERIOD**2)
+    coarse = stiffest_walls(masses, 1.85, PERIOD, -6.3e-4, 0.04)
     np.testing.assert_allclose(coarse, [83.0, 2.0 * 0.04 / 6.3e-4])
 
 
@@ -473,6 +475,16 @@ def test_drive_cycle_and_lag_belong_to_the_delay() -> None:
     assert modelled_delay(settings_with({})) == 1.0
     expected = 1.0 + 0.25 + 1000.0 / (2.0 * np.pi * 1600.0)
     np.testing.assert_allclose(modelled_delay(settings_with(keys)), expected)
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [{"bus.cycle_s": 0.00015}, {"estimator.delay_cycles": 3.0}, {"drive.drive_cycle_s": 0.003}],
+)
+def test_drive_that_is_too_late_for_the_cycle(keys: dict[str, float]) -> None:
+    drive = {"drive.drive_cycle_s": 0.00025, "drive.current_bandwidth_hz": 1600.0}
+    with pytest.raises(ConfigError, match=r"^bus.cycle_s: .* 3\.\d+ cycles .* has to be longer"):
+        modelled_delay(settings_with(drive | keys))
 
 
 def test_velocity_is_projected_with_the_covariance() -> None:
