@@ -60,7 +60,7 @@ _HAND_S = 1.5e-3
 #: delay with which it does: beyond, light hands bounce, and hunt in friction.
 _STIFFEST, _LONG_DELAY, _SOFTENING = 0.83, 1.85, 5.0
 #: Most that a count may change the force of a wall at the handle [N].
-_STEP_N = 2.0
+_STEP_N = 2.2
 
 
 def hand_damping(inertia: float, most: float) -> float:
