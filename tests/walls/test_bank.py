@@ -479,10 +479,11 @@ def test_drive_cycle_and_lag_belong_to_the_delay() -> None:
 
 @pytest.mark.parametrize(
     "keys",
-    [{"bus.cycle_s": 0.00015}, {"estimator.delay_cycles": 3.0}, {"drive.drive_cycle_s": 0.003}],
+    [{"bus.cycle_s": 0.00015}, {"estimator.delay_cycles": 3.0}, {"drive.drive_cycle_s": 0.002}],
 )
 def test_drive_that_is_too_late_for_the_cycle(keys: dict[str, float]) -> None:
     drive = {"drive.drive_cycle_s": 0.00025, "drive.current_bandwidth_hz": 1600.0}
+    drive["simulation.ideal"] = False
     with pytest.raises(ConfigError, match=r"^bus.cycle_s: .* 3\.\d+ cycles .* has to be longer"):
         modelled_delay(settings_with(drive | keys))
 
