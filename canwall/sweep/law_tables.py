@@ -183,13 +183,12 @@ def _make_plans(
         base = base.model_copy(update={"wall": base.wall.model_copy(update={"cap": None})})
     if table.draws:
         strikes = list(drawn_strikes(table.draws))
-        # Checked once: the conditions of all strikes are the same.
-        return [
-            _struck_otherwise(plan, strike)
-            for bench in table.benches.values() or [{}]
-            for plan in [make_plan(base, {"law": laws, **shared, **bench, **strikes[0]}, through)]
-            for strike in strikes
-        ]
+        plans = []
+        for bench in table.benches.values() or [{}]:
+            # Checked once: the conditions of all its strikes are the same.
+            plan = make_plan(base, {"law": laws, **shared, **bench, **strikes[0]}, through)
+            plans += [_struck_otherwise(plan, strike) for strike in strikes]
+        return plans
     if not table.searches:
         return [make_plan(base, {"law": laws, **shared}, through)]
     plain = {"damping_ratio": None, "damping_nm_s_per_rad": 0.0}
@@ -333,11 +332,16 @@ def _write_laws(dataset: xr.Dataset) -> Iterator[str]:
                 yield _row(f"{law}, {_servo_name(servo)}", cells)
 
 
+def _share_in_force(dataset: xr.Dataset) -> xr.DataArray:
+    """Return the stiffness in force over min(K, m/T²)."""
+    most = np.minimum(dataset["stiffness"], dataset["inertia"] / dataset["period"] ** 2)
+    return dataset["stiffness_in_force"] / most
+
+
 def _write_cap(dataset: xr.Dataset) -> Iterator[str]:
     """Yield failed strikes by criterion, and stiffness in force over min(K, m/T²), for each cap."""
     operators = _names(dataset, "operator")
-    most = np.minimum(dataset["stiffness"], dataset["inertia"] / dataset["period"] ** 2)
-    share = dataset["stiffness_in_force"] / most
+    share = _share_in_force(dataset)
     yield from _head(operators)
     for law in _names(dataset, "law"):
         for cap in dataset["wall.cap"].values.tolist():
@@ -365,8 +369,7 @@ def _write_benches(dataset: xr.Dataset) -> Iterator[str]:
     yield from _head([*operators, "failed", "of"])
     for name in _names(dataset, "bench"):
         bench = dataset.sel(bench=name)
-        most = np.minimum(bench["stiffness"], bench["inertia"] / bench["period"] ** 2)
-        share = bench["stiffness_in_force"] / most
+        share = _share_in_force(bench)
         cells = []
         for operator in operators:
             failed = bench["chatters"].sel(operator=operator)

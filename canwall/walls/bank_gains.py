@@ -131,7 +131,7 @@ def set_filters(
             walk *= heavier * slower**3  # by the cube of the bandwidth
             bank["within"][i] = 0.5 * _WITHIN * max(1.0 - felt_less, 0.0) * abs(count)
         _set_filter(bank, i, kalman_model(*plant, count, walk))
-        _set_paces(bank, i, plant, count, walk, slower, lively, rigid)
+        _set_paces(bank, i, plant, count, walk, lively / slower, rigid)
         _set_torques(bank, i, *plant)
         if rigid and heavier <= _LIGHT:
             in_flight = _IN_FLIGHT * lightest_bandwidth(bank["told"].item(), period)
@@ -145,18 +145,16 @@ def _set_paces(
     plant: tuple[float, float, float, float],
     count: float,
     walk: float,
-    slower: float,
-    lively: float,
+    faster: float,
     rigid: bool,
 ) -> None:
     """Write the gains of a filter and what rest tells it.
 
-    Its bandwidth goes with that of the delay. slower, lively: for the stiffest wall, and for a
-    handle that moves, over that of the lightest.
+    Its bandwidth goes with that of the delay. faster: that for a handle that moves, over that for
+    the stiffest wall.
     """
     period = plant[-1]
     paces = np.zeros((len(QUICKER), PACES + 1, 6))
-    faster = lively / slower
     shares = np.array(_shares(bank, i, faster))[:, None]
     for k, quicker in enumerate(QUICKER if rigid else [1.0] * len(QUICKER)):
         steady = _gain_and_rest(kalman_model(*plant, count, walk * quicker**3), period)
