@@ -99,13 +99,14 @@ class Estimator(Section):
     """`[estimator]`: the Kalman filter.
 
     Attributes:
-        force_walk_nm_per_sqrt_s: Random walk of the operator's force. Default: 0.2; with
-            operator.adapt so much for the lightest hand that its filter is nearly as quick as the
-            delay is short, and for heavier ones that theirs are as quick or slower.
+        force_walk_nm_per_sqrt_s: Random walk of the operator's force. Default: so much that the
+            filter of the lightest hand is nearly as quick as the delay is short, and that those of
+            others are as quick as encoder, wall and friction let them. With a value and without
+            operator.adapt it is a plain Kalman filter.
         delay_cycles: Delay D from the sampling of a position until the torque computed from it
             takes effect, in cycles. Default: 1 with synchronous PDOs; measured with others.
         delay_margin_cycles: What the model of the laws has more than that: too little delay costs
-            far more stiffness than too much. Default: 0.1 with operator.adapt, else 0.
+            far more stiffness than too much. Default: 0.1, and 0 for a plain filter.
         measure_delay: Measure the delay before the wall is rendered. False: where nothing tells
             it, neither delay_cycles nor synchronous PDOs. "auto": also where the lag of the
             drive's current loop is not known and a law has a model. True: always.

@@ -50,11 +50,9 @@ RECENT_CYCLES = 50
 #: Delay of a torque carried by a synchronous RPDO (theory, section 3).
 SYNCHRONOUS_DELAY = 1.0
 
-#: Random walk of a force, for a hand that is known [N·m/√s].
-_FORCE_WALK = 0.2
 #: Largest bandwidth of a filter on an elastic shaft, as a part of the resonance.
 _FILTER_PART = 0.125
-#: What the model has more than the delay that is told where the hand is unknown [periods].
+#: What the model has more than the delay that is told, but for a plain filter [periods].
 _DELAY_MARGIN = 0.1
 #: Missed motion below this is ignored, since a coarse encoder stays on one count for long [counts].
 _STUCK_COUNTS = 8
@@ -215,7 +213,7 @@ def make_cycle(settings: Settings, setup: DriveSetup, laws: Sequence[Law]) -> ND
     set_limits(cycle, settings.limits)
     set_guard(cycle["guard"][0], settings.guard.action, period, setup.units.rad_per_count)
     mass, viscous, spring = _model(settings)
-    if settings.operator.adapt:
+    if _has_bank(settings):
         masses, dampings = _hands(settings)
         mass, viscous = masses[0], dampings[0]
     set_plant(cycle["rendered"][0]["wall"][0], mass, viscous, spring, period)
@@ -250,9 +248,20 @@ def modelled_delay(settings: Settings) -> float:
     return delay
 
 
+def _has_bank(settings: Settings) -> bool:
+    """Return False for the filter of a hand that is known, whose random walk is given."""
+    return settings.operator.adapt or settings.estimator.force_walk_nm_per_sqrt_s is None
+
+
 def _hands(settings: Settings) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return masses and viscous dampings of the bank: the drive with lighter and heavier hands."""
+    """Return masses and viscous dampings of the bank: the drive with lighter and heavier hands.
+
+    Of a hand that is known they are those of `[mechanics]`.
+    """
     operator, mechanics = settings.operator, settings.mechanics
+    if not operator.adapt:
+        mass, viscous, _ = _model(settings)
+        return np.array([mass]), np.array([viscous])
     masses = np.geomspace(*settings.masses, operator.filters)
     hands = [
         hand_damping(max(mass - mechanics.inertia_kg_m2, 0.0), operator.damping_nm_s_per_rad)
@@ -265,7 +274,7 @@ def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None
     """Reset the estimator for a delay of `delay` periods, and its margin. Raises ValueError."""
     margin = settings.estimator.delay_margin_cycles
     if margin is None:
-        margin = _DELAY_MARGIN if settings.operator.adapt else 0.0
+        margin = _DELAY_MARGIN if _has_bank(settings) else 0.0
     margin = max(min(margin, MAX_DELAY - delay), 0.0)
     delay += margin
     mass, viscous, spring = _model(settings)
@@ -275,15 +284,13 @@ def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None
     cycle["shaft"] = shaft or 0.0
     bandwidth = _FILTER_PART * 2.0 * math.pi * shaft.resonance_hz if shaft else math.inf
     force_walk = settings.estimator.force_walk_nm_per_sqrt_s
-    if settings.operator.adapt:
+    if _has_bank(settings):
         masses, dampings = _hands(settings)
         mass, viscous, coulomb = masses[0], dampings[0], 0.0
         bandwidth = min(bandwidth, lightest_bandwidth(delay, period))
     if force_walk is None:
-        force_walk = _FORCE_WALK
-        if bandwidth < math.inf:
-            force_walk = force_walk_of(bandwidth, mass, period, abs(count))
-    if settings.operator.adapt:
+        force_walk = force_walk_of(bandwidth, mass, period, abs(count))
+    if _has_bank(settings):
         set_bank(
             cycle["bank"][0],
             masses,
@@ -367,8 +374,8 @@ def stiffest_for(cycle: NDArray[np.void], mass: float) -> float:
     bank, wall = cycle["bank"][0, 0], cycle["rendered"][0, 0]["wall"]
     if not (wall["cap"][0] and (n := bank["count"].item())):
         return float(wall["stiffest"][0])
-    place = (math.log(mass) - bank["log_lightest"]) / bank["log_step"]
-    return float(np.interp(place, np.arange(n), bank["stiffest"][:n]))
+    log_masses = bank["log_lightest"] + bank["log_step"] * np.arange(n)
+    return float(np.interp(math.log(mass), log_masses, bank["stiffest"][:n]))
 
 
 def _reset(cycle: NDArray[np.void], oriented: float) -> None:

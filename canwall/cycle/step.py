@@ -226,7 +226,7 @@ def _force_with_tpdo(cycle: Record, due: bool) -> float:
     if not math.isfinite(force):
         cycle.trip = _NAN
         return 0.0
-    if cycle.bank[0].adapts and not cycle.rendered[0].sampled:
+    if cycle.bank[0].count > 0 and not cycle.rendered[0].sampled:
         force = with_probe(cycle.bank[0], cycle.rendered[0].wall[0], force)
     return force
 
@@ -393,7 +393,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
         spread = cycle.bank[0].spread
         sample = at_sync(cycle.latch[0], estimator, spread, cycle.j, cycle.oriented)
         correct(estimator, sample)
-        if cycle.bank[0].adapts:
+        if cycle.bank[0].count > 0:
             _identify_operator(cycle, sample)
     else:
         begins_lag = _may_begin_to_lag(cycle)
@@ -414,7 +414,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
         predict_open_loop(estimator, sent)
     excess = cycle.bank[0].regression[0].excess
     expect_torques(cycle.latch[0], estimator, estimator.told + excess, cycle.j, sent)
-    if cycle.bank[0].adapts:
+    if cycle.bank[0].count > 0:
         predict_bank(cycle.bank[0], estimator, sent, age_at(cycle.latch[0], cycle.j))
     predict(estimator, sent)
     if begins_lag:

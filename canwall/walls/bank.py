@@ -2,7 +2,8 @@
 
 State and model in force are interpolated between the two filters next to the mass that a regression
 finds (`regression`), at the delay that it finds. The gains of the filters are made beforehand
-(`bank_gains`). Coulomb friction is left to the bias force d̂ (theory, section 8).
+(`bank_gains`). Coulomb friction is left to the bias force d̂ (theory, section 8). A hand that is
+known has a bank of one filter: it holds its mass, and finds the delay.
 
 The bank works on an estimator in its steady state and hands over state and model to it. In a gap
 of samples, and until the estimator has settled again, the estimator goes on alone and the bank
@@ -37,6 +38,7 @@ from canwall.walls.regression import (
     reset_regression,
     set_regression,
     solve,
+    solve_for_delay,
     torque_rises,
 )
 from canwall.walls.shaft import ElasticShaft
@@ -48,9 +50,8 @@ MAX_FILTERS = 24
 #: nothing of a Riccati equation is left for the cycle.
 BANK = np.dtype(
     [
-        ("adapts", "?"),
         ("holds", "?"),  # the mass in force, whatever is learned meanwhile; nothing is probed
-        ("count", "i8"),
+        ("count", "i8"),  # of the filters; 0: no bank
         ("log_lightest", "f8"),
         ("log_step", "f8"),
         ("spring", "f8"),
@@ -116,6 +117,7 @@ BANK = np.dtype(
         ("force_noise", "f8", (MAX_FILTERS,)),
         # The stiffest wall that shaft, delay and encoder bear.
         ("stiffest", "f8", (MAX_FILTERS,)),
+        ("delay_counts", "f8", (MAX_FILTERS,)),  # share of the doubt about the delay that counts
         ("regression", REGRESSION, (1,)),
         # Place of the mass in force on the scale of the filters' numbers.
         ("place", "f8"),
@@ -152,13 +154,12 @@ _EQUAL_SAMPLES = 32.0
 _WORTH = 0.015
 #: Deviation of ln(mass) below which the mass counts as known.
 _KNOWN_SPREAD = 0.2
+#: Lightest mass that explains the motion of a hand that is known, over the one told.
+_KNOWN_LIGHTEST = 0.5
 #: Growth in a period of ln(mass) once it was known and no longer is, while the torque rises: a hand
 #: that lets go within milliseconds looks heavy, since the wall gives way and nothing moves, and the
 #: handle would be thrown.
 _GROWTH_IN_DOUBT = 0.1
-#: Mass over the lightest one from which on doubt about the delay counts in full. A light hand would
-#: swing under the damping.
-_DELAY_COUNTS = 10.0
 
 
 def set_bank(
@@ -178,7 +179,8 @@ def set_bank(
 
     Args:
         bank: The bank.
-        masses: Masses of the filters, shape (n,), in geometric progression; 3 ≤ n ≤ MAX_FILTERS.
+        masses: Masses of the filters, shape (n,), in geometric progression; n ≤ MAX_FILTERS. A
+            single one is that of a hand that is known.
         viscous: Their viscous dampings, shape (n,).
         spring: Spring of all.
         period: T [s].
@@ -191,18 +193,19 @@ def set_bank(
         radius: Radius of the handle, at which the steps of the encoder are felt [m].
     """
     n = len(masses)
-    if not 3 <= n <= MAX_FILTERS:
-        raise ValueError(f"a bank has 3 to {MAX_FILTERS} filters, not {n}")
-    bank["adapts"], bank["count"] = True, n
+    if not 1 <= n <= MAX_FILTERS:
+        raise ValueError(f"a bank has 1 to {MAX_FILTERS} filters, not {n}")
+    bank["holds"], bank["count"] = n == 1, n
     bank["log_lightest"] = math.log(masses[0])
-    bank["log_step"] = math.log(masses[-1] / masses[0]) / (n - 1)
+    bank["log_step"] = math.log(masses[-1] / masses[0]) / (n - 1) if n > 1 else 0.0
     bank["spring"] = spring
     bank["forgotten"], bank["lively"] = round(_FORGOTTEN_S / period), round(_LIVELY_S / period)
     bank["flight"], bank["trend_left"] = round(_FLIGHT_S / period), math.exp(-period / _TREND_S)
     bank["landing"] = round(_LANDING_S / period)
     told = delay - margin
     bank["delay"], bank["told"] = delay, told
-    set_regression(bank["regression"][0, 0], float(masses[0]), period, count, told, shaft)
+    lightest = float(masses[0]) * (_KNOWN_LIGHTEST if n == 1 else 1.0)
+    set_regression(bank["regression"][0, 0], lightest, period, count, told, shaft)
     bank["stiffest"], bank["within"] = np.inf, 0.0
     bank["gain_in_flight"] = bank["trend_gain"] = 0.0
     bank["steadiest"] = STEADIEST * masses[-1] / period**2
@@ -263,15 +266,10 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
     _bound_velocity(bank, y_sample)
     changed = _identify(bank, estimator, y_sample)
     changed |= _follow_delay(bank, estimator)
-    k = min(int(bank.place), n - 2)
-    share = bank.place - k
-    estimator.y = state[0, k] + share * (state[0, k + 1] - state[0, k])
-    estimator.v = state[1, k] + share * (state[1, k + 1] - state[1, k])
+    estimator.y, estimator.v = _in_force(bank, state[0]), _in_force(bank, state[1])
     # As it will be on the average up to the end of the force that follows from it.
     ahead = 0.5 * (1.0 + bank.delay_in_force) * bank.regression[0].period
-    lighter = state[2, k] + ahead * bank.trend[k]
-    heavier = state[2, k + 1] + ahead * bank.trend[k + 1]
-    estimator.d = lighter + share * (heavier - lighter)
+    estimator.d = _in_force(bank, state[2]) + ahead * _in_force(bank, bank.trend)
     if changed:
         take_over(bank, estimator)
     return changed
@@ -401,7 +399,12 @@ def _identify(bank: Record, estimator: Record, y_sample: float) -> bool:
         bank.known = False
     if _torque_acted(estimator):
         bank.at_rest = 0
-        return learned and not bank.holds and _follow(bank, torque_rises(regression, estimator))
+        if not learned:
+            return False
+        if bank.holds:
+            solve_for_delay(regression, bank.mass)
+            return False
+        return _follow(bank, torque_rises(regression, estimator))
     bank.at_rest += 1
     if bank.at_rest != bank.forgotten:
         return False
@@ -472,11 +475,17 @@ def _place_of(bank: Record, likeliest: float) -> float:
 
 
 @compiled
+def _in_force(bank: Record, of_filters: NDArray[np.float64]) -> float:
+    """Return a quantity between those of the two filters next to the mass in force."""
+    k = min(int(bank.place), max(bank.count - 2, 0))
+    share = bank.place - k
+    return of_filters[k] + share * (of_filters[k + 1] - of_filters[k])
+
+
+@compiled
 def stiffest(bank: Record) -> float:
     """Return the stiffness of the stiffest wall, with the mass in force."""
-    k = min(int(bank.place), bank.count - 2)
-    share = bank.place - k
-    return bank.stiffest[k] + share * (bank.stiffest[k + 1] - bank.stiffest[k])
+    return _in_force(bank, bank.stiffest)
 
 
 @compiled
@@ -488,15 +497,15 @@ def doubt(bank: Record) -> float:
     resonance.
     """
     regression = bank.regression[0]
-    if bank.holds or regression.rotor > 0.0:
+    if regression.rotor > 0.0:
         return 0.0
-    if bank.spread == 0.0:
+    of_mass = 0.0 if bank.holds else bank.spread
+    if of_mass == 0.0 and not bank.holds:
         return 1.0
     of_delay = 0.0
     if bank.lively_left > 0:
-        heavy = min(bank.place * bank.log_step / math.log(_DELAY_COUNTS), 1.0)
-        of_delay = heavy * regression.excess_spread
-    return min(bank.spread + of_delay, 1.0)
+        of_delay = _in_force(bank, bank.delay_counts) * regression.excess_spread
+    return min(of_mass + of_delay, 1.0)
 
 
 @compiled
@@ -505,10 +514,7 @@ def take_over(bank: Record, estimator: Record) -> None:
 
     With those of another mass it may diverge.
     """
-    k = min(int(bank.place), bank.count - 2)
-    share = bank.place - k
-    viscous = bank.viscous[k] + share * (bank.viscous[k + 1] - bank.viscous[k])
-    set_model(estimator, bank.mass, viscous, bank.spring)
+    set_model(estimator, bank.mass, _in_force(bank, bank.viscous), bank.spring)
     i = int(bank.place + 0.5)
     if not estimator.settled:
         for row in range(3):

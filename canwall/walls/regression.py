@@ -123,6 +123,8 @@ _PRIOR_LIGHTNESS, _PRIOR_RATE, _PRIOR_RATE_DEVIATION, _PRIOR_STEADY = 0.7, 100.0
 #: Delay beyond the one told, before the first torque: standard deviation, and the most; what is
 #: added to the deviation from one hand to the next [periods].
 _PRIOR_EXCESS, _MOST_EXCESS, _EXCESS_CHANGES = 0.3, 0.5, 0.05
+#: Standard deviation of ln(m) of a hand that is known.
+_KNOWN = 0.01
 #: Coulomb friction that there may be: standard deviation, and the most that explains a surprise
 #: [N·m].
 _FRICTION = 0.02
@@ -472,11 +474,35 @@ def solve(regression: Record, mass: float) -> tuple[float, float]:
     is known before the first torque; c is what is steady. mass: the one in force, for friction and
     delay.
     """
-    normal, lightest = regression.normal, regression.lightest
-    normal[:] = regression.information
+    lightest, normal = regression.lightest, regression.normal
+    _set_normal(regression, mass - regression.rotor, (lightest / _PRIOR_LIGHTNESS) ** 2, lightest)
+    told = normal[4, 4]
+    precision = normal[1, 1] - normal[1, 4] * normal[1, 4] / told
+    lightness = -(normal[0, 1] - normal[1, 4] * normal[0, 4] / told) / precision
+    deviation = 1.0 / math.sqrt(precision)
+    if lightness > 0.0:
+        _find_delay(regression, lightness)
+    return mean_above_zero(lightness, deviation), deviation
+
+
+@compiled
+def solve_for_delay(regression: Record, mass: float) -> None:
+    """Find the delay as `solve` does, with a hand that is known."""
     mass -= regression.rotor
-    before = (lightest / _PRIOR_LIGHTNESS) ** 2
-    _add_knowledge(normal, 1, before, 1.0 / lightest)
+    _set_normal(regression, mass, (mass / _KNOWN) ** 2, mass)
+    _find_delay(regression, 1.0 / mass)
+
+
+@compiled
+def _set_normal(regression: Record, mass: float, precision: float, known: float) -> None:
+    """Set up the normal equations of 1/m and δ/m.
+
+    mass: the one in force, of the load on an elastic shaft. precision: that of 1/m as it is known
+    before, 1/known.
+    """
+    normal = regression.normal
+    normal[:] = regression.information
+    _add_knowledge(normal, 1, precision, 1.0 / known)
     _add_knowledge(normal, 2, 1.0 / _PRIOR_RATE_DEVIATION**2, -_PRIOR_RATE)
     _add_knowledge(normal, 3, (mass / _FRICTION) ** 2, 0.0)
     precision, excess = regression.excess_before[0], regression.excess_before[1]
@@ -485,15 +511,17 @@ def solve(regression: Record, mass: float) -> tuple[float, float]:
     _eliminate(normal, 5)
     _eliminate(normal, 3)
     _eliminate(normal, 2)
-    told = normal[4, 4]
-    precision = normal[1, 1] - normal[1, 4] * normal[1, 4] / told
-    lightness = -(normal[0, 1] - normal[1, 4] * normal[0, 4] / told) / precision
-    deviation = 1.0 / math.sqrt(precision)
-    if lightness > 0.0 and regression.rotor == 0.0:
-        excess = -(normal[0, 4] + normal[1, 4] * lightness) / (told * lightness)
-        regression.excess = min(max(excess, -_MOST_EXCESS), _MOST_EXCESS)
-        regression.excess_spread = _excess_spread(regression, lightness)
-    return mean_above_zero(lightness, deviation), deviation
+
+
+@compiled
+def _find_delay(regression: Record, lightness: float) -> None:
+    """Find the delay from the normal equations and 1/m; on an elastic shaft it is as told."""
+    if regression.rotor > 0.0:
+        return
+    normal = regression.normal
+    excess = -(normal[0, 4] + normal[1, 4] * lightness) / (normal[4, 4] * lightness)
+    regression.excess = min(max(excess, -_MOST_EXCESS), _MOST_EXCESS)
+    regression.excess_spread = _excess_spread(regression, lightness)
 
 
 @compiled

@@ -46,10 +46,10 @@ def _seconds(work: Callable[[], object], repeats: int = 5) -> float:
 
 
 def closed_loop() -> dict[str, Any]:
-    """Periods per second and core: plant with friction, encoder, estimator, law."""
+    """Periods per second and core: plant with friction, encoder, plain estimator, law."""
     found = {}
     for law in ("standard", "half_sample", "mean_force", "push_only"):
-        ready = ClosedLoop(_struck(law), _STRIKE).records()
+        ready = ClosedLoop(_settings(law, guard="warn"), _STRIKE).records()
         into = ready, 50.0, 0.0, np.zeros(1, ROW), np.empty((SIGNALS, _STRIKE))
         simulate_wall(*into)
         found[law] = round(
@@ -170,7 +170,11 @@ def _settings(law: str, guard: str = "off", adapt: bool = False, **axes: Any) ->
     settings = _struck(law, **axes)
     given = settings.guard.model_copy(update={"action": guard})
     operator = settings.operator.model_copy(update={"adapt": adapt})
-    return settings.model_copy(update={"guard": given, "operator": operator})
+    # Without, a plain filter: that of a known hand is a bank of one.
+    walk = {} if adapt else {"force_walk_nm_per_sqrt_s": 0.2}
+    estimator = settings.estimator.model_copy(update=walk)
+    update = {"guard": given, "operator": operator, "estimator": estimator}
+    return settings.model_copy(update=update)
 
 
 def _embedded(supervised: bool) -> None:

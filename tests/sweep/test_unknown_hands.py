@@ -1,4 +1,7 @@
-"""Walls with a cap in hands that the laws do not know: shares of the table in docs/results.md."""
+"""Walls with a cap in hands that the laws do not know, and in known ones.
+
+The former are shares of the table in docs/results.md.
+"""
 
 from typing import Any
 
@@ -17,12 +20,15 @@ pytestmark = pytest.mark.slow
 _ASKED = np.geomspace(30.0, 5000.0, 12).round(1)
 
 
-def _strikes(operator: str, friction: float, delay_error: float) -> NDArray[np.void]:
-    """Return the measures of 108 strikes on the servo of 1600 Hz."""
-    settings = config.load(config.shipped("config/sim.toml"), {"wall.cap": 0.5})
+def _strikes(
+    operator: str, friction: float, delay_error: float, model: str = "drive", **keys: float
+) -> NDArray[np.void]:
+    """Return the measures of 108 strikes on the servo of 1600 Hz; keys: with __ for the dot."""
+    given = {key.replace("__", "."): value for key, value in keys.items()}
+    settings = config.load(config.shipped("config/sim.toml"), {"wall.cap": 0.5} | given)
     axes = {
         "law": "mean_force",
-        "model": "drive",
+        "model": model,
         "servo": "1600Hz",
         "operator": operator,
         "friction": friction,
@@ -43,6 +49,19 @@ def _strikes(operator: str, friction: float, delay_error: float) -> NDArray[np.v
 def test_cap_keeps_every_wall_quiet_in_a_light_hand(operator: str, delay_error: float) -> None:
     for friction in (0.0, 0.02):
         assert _strikes(operator, friction, delay_error)["chatters"].sum() == 0
+
+
+@pytest.mark.parametrize("delay_error", [-0.3, 0.0, 0.15])
+@pytest.mark.parametrize("operator", ["fingertip", "finger", "grip", "hand", "arm"])
+def test_known_hand_is_no_worse_than_an_unknown_one(operator: str, delay_error: float) -> None:
+    found = [_strikes(operator, f, delay_error, "matched") for f in (0.0, 0.02)]
+    assert np.concatenate(found)["chatters"].sum() <= (2 if operator == "arm" else 0)
+
+
+def test_known_hand_under_a_plain_filter_is_worse_than_an_unknown_one() -> None:
+    """The random walk of the source text is for an ideal servo."""
+    plain = {"estimator__force_walk_nm_per_sqrt_s": 0.2}
+    assert _strikes("grip", 0.0, 0.0, "matched", **plain)["chatters"].mean() > 0.5
 
 
 @pytest.mark.parametrize(("operator", "most"), [("fingertip", 31), ("finger", 14), ("grip", 25)])
