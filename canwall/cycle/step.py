@@ -25,13 +25,13 @@ from canwall.walls import (
     doubt,
     end_lag,
     expect_torques,
+    is_probe_in_flight,
     likelier,
     may_lag,
     note_missing_sample,
     predict,
     predict_bank,
     predict_open_loop,
-    probe_acts,
     put_in_force,
     set_applied_force,
     set_pace,
@@ -320,7 +320,7 @@ def _may_begin_to_lag(cycle: Record) -> bool:
 def _compare_lag(cycle: Record) -> None:
     """Compare the sample with both predictions, and go on with the likelier one in the end."""
     lagging, losing = cycle.lagging[0], cycle.losing[0]
-    if not probe_acts(cycle.bank[0].regression[0]):
+    if not is_probe_in_flight(cycle.bank[0].probe[0]):
         # What a probe moves tells who is at the handle, whom neither model knows yet.
         cycle.lag_evidence += likelier(lagging, losing, cycle.oriented)
     if cycle.lag_evidence > _LAG_EVIDENCE:
@@ -405,7 +405,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     force = 0.0
     if active:
         force = _wanted_force(cycle, received, due)
-    demanded = 0.0 if cycle.bank[0].regression[0].probing else force
+    demanded = 0.0 if cycle.bank[0].probe[0].acts else force
     limit = _torque_limit(cycle)
     per_mille = to_per_mille(cycle.orientation * force, cycle.nm_per_mille, limit)
     torque = per_mille * cycle.nm_per_mille
@@ -424,7 +424,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
         predict(cycle.lagging[0], sent)
         predict(cycle.losing[0], sent)
     applied = acting_force(estimator, estimator.in_flight)
-    probes = cycle.bank[0].regression[0].probes
+    probes = cycle.bank[0].probe[0].in_flight
     # What shows who is coming is no force of the wall.
     cycle.force_applied = applied - acting_force(estimator, probes)
     if due:

@@ -54,8 +54,8 @@ from canwall.walls.interface import (
 )
 from canwall.walls.latch import LATCH, age_at, at_sync, expect_torques, reset_latch, set_latch
 from canwall.walls.layers import TENSION, set_applied_force, wall_force
+from canwall.walls.probe import is_probe_in_flight
 from canwall.walls.registry import LAWS, declare_law, find_law, is_declared
-from canwall.walls.regression import probe_acts
 from canwall.walls.shaft import ElasticShaft, WallLoop, stiffest_wall
 
 __all__ = [
@@ -90,6 +90,7 @@ __all__ = [
     "force_walk_of",
     "hand_damping",
     "is_declared",
+    "is_probe_in_flight",
     "law",
     "lightest_bandwidth",
     "likelier",
@@ -98,7 +99,6 @@ __all__ = [
     "predict",
     "predict_bank",
     "predict_open_loop",
-    "probe_acts",
     "put_in_force",
     "reset_bank",
     "reset_estimator",

@@ -25,16 +25,24 @@ from canwall.walls.bank_gains import (
     stiffest_walls,
 )
 from canwall.walls.estimator import MAX_DELAY, set_model, set_model_delay
+from canwall.walls.probe import (
+    PROBE,
+    other_torque_acts,
+    probe_torque,
+    reset_probe,
+    send_probe,
+    set_probe,
+)
 from canwall.walls.regression import (
     HAND_RATE,
+    OBSERVER_SLOWER_BEHIND_SHAFT,
     REGRESSION,
     begin_regression,
+    comes,
     forget_mass,
     learn,
     moves,
     predict_regression,
-    probe,
-    put_probe_in_flight,
     reset_regression,
     set_regression,
     solve,
@@ -119,6 +127,7 @@ BANK = np.dtype(
         ("stiffest", "f8", (MAX_FILTERS,)),
         ("delay_counts", "f8", (MAX_FILTERS,)),  # share of the doubt about the delay that counts
         ("regression", REGRESSION, (1,)),
+        ("probe", PROBE, (1,)),
         # Place of the mass in force on the scale of the filters' numbers.
         ("place", "f8"),
         ("at_rest", "i8"),  # samples without torque in a row
@@ -206,6 +215,8 @@ def set_bank(
     bank["delay"], bank["told"] = delay, told
     lightest = float(masses[0]) * (_KNOWN_LIGHTEST if n == 1 else 1.0)
     set_regression(bank["regression"][0, 0], lightest, period, count, told, shaft)
+    slower = 1 if shaft is None else OBSERVER_SLOWER_BEHIND_SHAFT
+    set_probe(bank["probe"][0, 0], lightest, period, count, slower)
     bank["stiffest"], bank["within"] = np.inf, 0.0
     bank["gain_in_flight"] = bank["trend_gain"] = 0.0
     bank["steadiest"] = STEADIEST * masses[-1] / period**2
@@ -223,6 +234,7 @@ def reset_bank(bank: NDArray[np.void], y: float) -> None:
     bank["landed"], bank["pressed"], bank["presses"] = bank["landing"], 0, False
     bank["state"][:, 0] = y
     reset_regression(bank["regression"][0, 0], y)
+    reset_probe(bank["probe"][0, 0])
     bank["place"], bank["spread"], bank["known"] = 0.0, 0.0, False
     bank["mass"] = np.exp(bank["log_lightest"])
     bank["at_rest"] = 0
@@ -248,6 +260,7 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
         bank.equal = bank.alone = bank.pressed = 0
         bank.flies = bank.presses = False
         begin_regression(bank.regression[0], y_sample, estimator.in_flight[estimator.delay_periods])
+        bank.probe[0].samples = 0
         return False
     _note_flight(bank, estimator)
     slow = _SLOW * bank.regression[0].period + bank.regression[0].resolution
@@ -281,11 +294,11 @@ def _note_flight(bank: Record, estimator: Record) -> None:
 
     A flight is its way far from any contact, under no torque but a probe's.
     """
-    regression, now = bank.regression[0], estimator.delay_periods
-    bank.alone = 0 if _wall_acted(bank, estimator) else bank.alone + 1
-    bank.flies = bank.alone > bank.flight and moves(regression)
+    probe, now = bank.probe[0], estimator.delay_periods
+    bank.alone = 0 if other_torque_acts(probe, estimator.in_flight, now) else bank.alone + 1
+    bank.flies = bank.alone > bank.flight and moves(bank.regression[0])
     bank.landed = 0 if bank.flies else bank.landed + 1
-    wall_acts = estimator.in_flight[now] != regression.probes[now]
+    wall_acts = estimator.in_flight[now] != probe.in_flight[now]
     bank.pressed = bank.pressed + 1 if wall_acts else 0
     bank.presses = bank.landed <= bank.landing and bank.pressed >= _PRESSED
 
@@ -394,7 +407,8 @@ def _bound_velocity(bank: Record, y_sample: float) -> None:
 def _identify(bank: Record, estimator: Record, y_sample: float) -> bool:
     """Follow what a sample tells of the mass; return True if the mass in force changed."""
     regression, calm = bank.regression[0], bank.lively_left == 0
-    learned = learn(regression, estimator, y_sample, bank.mass, calm)
+    probed = bank.probe[0].samples > 0
+    learned = learn(regression, estimator, y_sample, bank.mass, calm, probed)
     if regression.swung:
         bank.known = False
     if _torque_acted(estimator):
@@ -416,16 +430,6 @@ def _identify(bank: Record, estimator: Record, y_sample: float) -> bool:
 def _torque_acted(estimator: Record) -> bool:
     for age in range(estimator.delay_periods, MAX_DELAY + 1):
         if estimator.in_flight[age] != 0.0:
-            return True
-    return False
-
-
-@compiled
-def _wall_acted(bank: Record, estimator: Record) -> bool:
-    """Return True if a torque other than a probe's acted."""
-    probes = bank.regression[0].probes
-    for age in range(estimator.delay_periods, MAX_DELAY + 1):
-        if estimator.in_flight[age] != probes[age]:
             return True
     return False
 
@@ -545,7 +549,7 @@ def predict_bank(bank: Record, estimator: Record, force: float, age: float = 0.0
     older = estimator.in_flight[n]
     newer = force if n == 0 else estimator.in_flight[n - 1]
     predict_regression(bank.regression[0], estimator.in_flight, force, age)
-    put_probe_in_flight(bank.regression[0], force)
+    send_probe(bank.probe[0], force)
     state, phi = bank.state, bank.phi
     left = 1.0 if bank.flies or bank.presses else bank.trend_left
     for i in range(bank.count):
@@ -561,8 +565,9 @@ def predict_bank(bank: Record, estimator: Record, force: float, age: float = 0.0
 @compiled
 def with_probe(bank: Record, wall: Record, force: float) -> float:
     """Return the force of a law, and where that is zero the torque of a probe, unless it holds."""
+    probe, regression = bank.probe[0], bank.regression[0]
     if force == 0.0 and not bank.holds:
         known = 0.0 < bank.spread < _KNOWN_SPREAD
-        return probe(bank.regression[0], wall, bank.mass, known)
-    bank.regression[0].probed = 0
+        return probe_torque(probe, wall, regression.way, comes(regression), bank.mass, known)
+    probe.samples = 0
     return force

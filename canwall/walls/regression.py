@@ -12,10 +12,7 @@ hand goes.
 On an elastic shaft it is the load that is observed, by what the rotor tells of it, and the delay is
 as told.
 
-The torque is the wall's, or a probe's: shortly before a contact the handle is pushed to and fro by
-a few counts, so that a light hand is told from a heavy one before the wall acts. The torque begins
-with what moves the lightest hand by as much, and grows with the mass that is found, and with the
-speed of a hand that is not known.
+The torque is the wall's, or a probe's.
 """
 
 import math
@@ -70,19 +67,13 @@ REGRESSION = np.dtype(
         ("way_samples", "i8"),  # their number
         ("steady", "i8"),  # samples since the handle stuck, or turned on an elastic shaft
         ("moving", "i8"),  # their number from which on the handle moves
-        ("probe", "f8"),  # torque before a contact for the lightest hand [N·m]
-        ("stronger", "f8"),  # that of the present probe, as a multiple of it
-        ("probe_samples", "i8"),  # half its period
-        ("probed", "i8"),  # samples of the present probe
-        ("probing", "?"),  # the force of this cycle is a probe's
-        ("probes", "f8", (MAX_DELAY + 1,)),  # torques of probes in flight, newest first
     ],
     align=True,
 )
 
-#: Bandwidth of the observer, faster than what hand and friction do meanwhile [Hz], and behind an
-#: elastic shaft, of which little is known near its resonance.
-_OBSERVER_HZ, _OBSERVER_BEHIND_SHAFT_HZ = 100.0, 50.0
+#: Bandwidth of the observer, faster than what hand and friction do meanwhile [Hz], and by how much
+#: it is slower behind an elastic shaft, of which little is known near its resonance.
+_OBSERVER_HZ, OBSERVER_SLOWER_BEHIND_SHAFT = 100.0, 2
 #: Noise of its surprise by the steps of the encoder [counts], and share of the noise that is
 #: exchanged with a sample: drives latch their position at ticks of their own.
 _QUANTISATION, _NOISE_SHARE = 0.5, 1.0 / 16.0
@@ -128,15 +119,6 @@ _KNOWN = 0.01
 #: Coulomb friction that there may be: standard deviation, and the most that explains a surprise
 #: [N·m].
 _FRICTION = 0.02
-#: Time before a contact from which on the handle is probed, half the period of the probe, as slow
-#: as the observer lets through [s], and its least samples.
-_PROBE_S, _PROBE_HALF_S, _PROBE_SAMPLES = 0.06, 0.004, 2
-#: Motion of a hand under the probe, from end to end [counts], and the strongest torque of a probe
-#: for any but the lightest one [N·m].
-_PROBE_COUNTS, _STRONGEST_PROBE = 4.0, 0.04
-#: Way of a sample [counts] from which on the probe of a hand that is not known grows with it: the
-#: lightest handle moves by a third of its way.
-_PROBE_WAY = 3.0
 
 
 def set_regression(
@@ -163,7 +145,7 @@ def set_regression(
     regression["lightest"] = lightest - regression["rotor"]
     regression["delay"] = delay
     set_swing(regression["swing"][0], period, count)
-    bandwidth = _OBSERVER_BEHIND_SHAFT_HZ if shaft else _OBSERVER_HZ
+    bandwidth = _OBSERVER_HZ / (OBSERVER_SLOWER_BEHIND_SHAFT if shaft else 1)
     regression["gain"] = gain = _observer_gain(bandwidth, period)
     regression["surprise"][5] = abs(count)
     regression["hand_torque"] = HAND_RATE * period / gain[2]
@@ -172,12 +154,6 @@ def set_regression(
     least_way = _LEAST_WAY * abs(count)
     regression["way_samples"] = min(max(round(least_way / (_TOLD_FROM_REST * period)), 1), _RECENT)
     regression["moving"] = max(round(_STEADY_S / period), _STEADY)
-    slower = round(_OBSERVER_HZ / bandwidth)
-    regression["probe_samples"] = samples = slower * max(
-        round(_PROBE_HALF_S / period), _PROBE_SAMPLES
-    )
-    quarter = 0.5 * samples * period
-    regression["probe"] = slower * _PROBE_COUNTS * abs(count) * lightest / quarter**2
 
 
 def _observer_gain(bandwidth: float, period: float) -> NDArray[np.float64]:
@@ -193,7 +169,7 @@ def _observer_gain(bandwidth: float, period: float) -> NDArray[np.float64]:
 
 def reset_regression(regression: np.void, y: float) -> None:
     """Begin at rest at y, with nothing known of mass and delay."""
-    for name in ("observed", "information", "way", "steady", "probed", "probing", "probes"):
+    for name in ("observed", "information", "way", "steady"):
         regression[name] = 0
     for name in ("begun", "bend", "shaft_torque", "excess"):
         regression[name] = 0.0
@@ -212,6 +188,13 @@ def moves(regression: Record) -> bool:
 
 
 @compiled
+def comes(regression: Record) -> bool:
+    """Return True if the handle goes towards the wall, by more than the steps of the encoder."""
+    way = -regression.way * regression.way_samples
+    return bool(way >= _LEAST_WAY * regression.resolution)
+
+
+@compiled
 def begin_regression(regression: Record, y: float, torque: float) -> None:
     """Begin at rest at y, where something holds against a torque; what is known stays.
 
@@ -224,7 +207,7 @@ def begin_regression(regression: Record, y: float, torque: float) -> None:
     regression.observed[0, 0] = regression.load = y - regression.softness * t * t * torque
     regression.samples[:] = y
     regression.way = 0.0
-    regression.steady = regression.probed = 0
+    regression.steady = 0
     end_swing(regression.swing[0])
     regression.noise = (_QUANTISATION * regression.resolution) ** 2
 
@@ -239,11 +222,18 @@ def forget_mass(regression: Record) -> None:
 
 
 @compiled
-def learn(regression: Record, estimator: Record, y_sample: float, mass: float, calm: bool) -> bool:
+def learn(
+    regression: Record,
+    estimator: Record,
+    y_sample: float,
+    mass: float,
+    calm: bool,
+    probed: bool,
+) -> bool:
     """Learn from a sample; return True if what is known of the mass has changed.
 
     estimator: with the torques in flight. mass: the one in force. calm: True if the handle has not
-    moved fast for a while; of no meaning on an elastic shaft.
+    moved fast for a while; of no meaning on an elastic shaft. probed: True if it is being probed.
     """
     mass -= regression.rotor
     if regression.rotor > 0.0:
@@ -268,7 +258,7 @@ def learn(regression: Record, estimator: Record, y_sample: float, mass: float, c
         return True
     if not torque_rises(regression, estimator):
         least = 1.0
-    tells = moves(regression) and (regression.probed > 0 or told > least)
+    tells = moves(regression) and (probed or told > least)
     if tells or told > _STRONG:
         untimely = _UNTIMELY * steps / mass + _UNTIMELY * steps * regression.softness
         _add_information(regression, untimely, mass)
@@ -591,47 +581,3 @@ def predict_regression(
     v = (2.0 * y[0] - 3.0 * y[1] + y[2]) / t
     x[0, 2] += 0.5 * t * t * v
     x[1, 2] += t * v
-
-
-@compiled
-def probe(regression: Record, wall: Record, mass: float, known: bool) -> float:
-    """Return a torque to and fro if the handle is about to come into contact, else zero.
-
-    To be called while the wall gives no force. mass: the one in force. known: True if it was found
-    with little doubt; of a stranger that comes fast there is little time to learn.
-    """
-    comes = -regression.way * regression.way_samples >= _LEAST_WAY * regression.resolution
-    if not (comes and 0.0 < wall.y <= -wall.v * _PROBE_S):
-        regression.probed = 0
-        return 0.0
-    # The first half is half as long: the handle is pushed about its own path. It stays about it if
-    # the torque changes where the probe adds nothing to its velocity, half-way.
-    half = regression.probe_samples
-    swing = (regression.probed + half // 2) // half
-    if regression.probed % half == 0:
-        heavier = mass / (regression.lightest + regression.rotor)
-        faster = 0.0 if known else -regression.way / (_PROBE_WAY * regression.resolution)
-        most = _STRONGEST_PROBE / regression.probe
-        regression.stronger = max(min(max(heavier, faster), most), 1.0)
-    regression.probed += 1
-    regression.probing = True
-    torque = regression.stronger * regression.probe
-    return torque if swing % 2 == 0 else -torque
-
-
-@compiled
-def probe_acts(regression: Record) -> bool:
-    """Return True if one of the torques in flight is a probe's."""
-    acts = False
-    for torque in regression.probes:
-        acts |= torque != 0.0
-    return acts
-
-
-@compiled
-def put_probe_in_flight(regression: Record, force: float) -> None:
-    """Note the part of a probe in the force that is sent, as it is rounded."""
-    for age in range(MAX_DELAY, 0, -1):
-        regression.probes[age] = regression.probes[age - 1]
-    regression.probes[0] = force if regression.probing else 0.0
-    regression.probing = False

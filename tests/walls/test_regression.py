@@ -1,4 +1,4 @@
-"""The regression that finds the mass at the handle, and its probe."""
+"""The regression that finds the mass at the handle."""
 
 import math
 
@@ -9,7 +9,7 @@ from scipy.signal import place_poles
 from scipy.stats import truncnorm
 
 from canwall.physics import advance, make_plant
-from canwall.walls import ESTIMATOR, MAX_DELAY, WALL
+from canwall.walls import ESTIMATOR, MAX_DELAY
 from canwall.walls.regression import (
     REGRESSION,
     begin_regression,
@@ -18,7 +18,6 @@ from canwall.walls.regression import (
     mean_above_zero,
     moves,
     predict_regression,
-    probe,
     reset_regression,
     set_regression,
     solve,
@@ -55,7 +54,7 @@ def play(
     y, v, known = 0.0, -0.5, LIGHTEST
     for torque, pushed in zip(torques.tolist(), push.tolist(), strict=True):
         sample = COUNT * round((y + jitter * v * rng.uniform(-0.5, 0.5)) / COUNT)
-        learn(regression[0], estimator[0], sample, known, calm)
+        learn(regression[0], estimator[0], sample, known, calm, False)
         known = mass_known(regression, known)
         send(regression, estimator, torque)
         a = (torque + pushed - 0.01 * v) / mass
@@ -75,7 +74,7 @@ def test_slow_motion_is_told_from_rest(counts: int, rate: float) -> None:
     moved = []
     for j in range(400):
         y = speed * max(j - 200, 0) / rate
-        learn(regression[0], estimator[0], count * round(y / count), LIGHTEST, False)
+        learn(regression[0], estimator[0], count * round(y / count), LIGHTEST, False, False)
         predict_regression(regression[0], estimator[0]["in_flight"], 0.0, 0.0)
         moved.append(bool(moves(regression[0])))
     assert not any(moved[:200])
@@ -138,7 +137,7 @@ def test_another_hand_is_another_mass() -> None:
     for j in range(200):
         mass = 3.6e-3 if j < 100 else 2e-4
         torque = 0.4 if j % 40 < 3 else 0.0
-        learn(regression[0], estimator[0], COUNT * round(y / COUNT), known, False)
+        learn(regression[0], estimator[0], COUNT * round(y / COUNT), known, False, False)
         known = mass_known(regression, known)
         send(regression, estimator, torque)
         a = torque / mass
@@ -156,7 +155,7 @@ def swing(delay: float, told: float, mass: float) -> NDArray[np.void]:
     share = (delay - 1.0) * PERIOD
     rng = np.random.default_rng(2)
     for _ in range(150):
-        learn(regression[0], estimator[0], COUNT * round(y / COUNT), known, False)
+        learn(regression[0], estimator[0], COUNT * round(y / COUNT), known, False, False)
         known = mass_known(regression, known)
         older, newer = estimator["in_flight"][0, 1], estimator["in_flight"][0, 0]
         send(regression, estimator, (0.2 + 300.0 * mass) * rng.choice([-1.0, 0.0, 1.0]))
@@ -212,7 +211,7 @@ def test_swing_against_friction_tells_the_mass(mass: float) -> None:
     y, v, known = 0.0, 0.0, 2.0 * mass
     for j in range(200):
         torque = 250.0 * mass * math.sin(2.0 * math.pi * j / 10.0)
-        learn(regression[0], estimator[0], COUNT * round(y / COUNT), known, False)
+        learn(regression[0], estimator[0], COUNT * round(y / COUNT), known, False, False)
         found, deviation = solve(regression[0], known)
         known = 1.0 / max(found, 200.0)
         send(regression, estimator, torque)
@@ -252,67 +251,11 @@ def test_torque_that_something_holds_tells_nothing() -> None:
         estimator["in_flight"] = torque
         begin_regression(regression[0], 0.0, held)
         for _ in range(60):
-            learn(regression[0], estimator[0], 0.0, LIGHTEST, False)
+            learn(regression[0], estimator[0], 0.0, LIGHTEST, False, False)
             send(regression, estimator, torque)
         found.append(mass_known(regression, LIGHTEST))
     assert found[0] == pytest.approx(LIGHTEST, rel=0.2)
     assert found[1] > 4.0 * LIGHTEST
-
-
-def test_probe_is_shortly_before_a_contact_only() -> None:
-    regression, wall = made(), np.zeros(1, WALL)
-
-    def probed(y: float, v: float) -> float:
-        wall["y"], wall["v"] = y, v
-        regression["way"] = PERIOD * v
-        return float(probe(regression[0], wall[0], LIGHTEST, True))
-
-    assert probed(0.05, -0.5) == 0.0  # 100 ms away
-    assert probed(0.01, 0.5) == 0.0  # on its way out
-    assert probed(0.01, -0.05) == 0.0  # so slow that friction is not behind
-    torques = [probed(0.02 - 0.0005 * j, -0.5) for j in range(40)]
-    amplitude = 4.0 * COUNT * LIGHTEST / (2.0 * PERIOD) ** 2
-    np.testing.assert_allclose(np.abs(torques), amplitude)
-    # Four samples to and four fro: the lightest handle swings by four counts about its path.
-    assert np.sign(torques[:14]).tolist() == [1, 1] + 4 * [-1] + 4 * [1] + 4 * [-1]
-    v = np.cumsum(torques[:32]) * PERIOD / LIGHTEST
-    y = np.cumsum(v) * PERIOD
-    drift = np.polynomial.Polynomial.fit(np.arange(32), y, 1)(np.arange(32))
-    assert np.ptp(y - drift) == pytest.approx(4.0 * COUNT, rel=0.35)
-
-
-def test_probe_of_a_stranger_grows_with_its_speed() -> None:
-    """It moves the lightest handle by a third of its way, with 0.04 N·m at the most."""
-    for counts, known, stronger in (
-        (2.0, False, 1.0),
-        (12.0, False, 4.0),
-        (12.0, True, 1.0),
-        (90.0, False, 0.04 / 0.0048),
-    ):
-        regression, wall = made(), np.zeros(1, WALL)
-        regression["way"] = -counts * COUNT
-        wall["y"], wall["v"] = 0.0005, -counts * COUNT / PERIOD
-        torques = [probe(regression[0], wall[0], LIGHTEST, known) for _ in range(8)]
-        np.testing.assert_allclose(np.abs(torques), stronger * 0.0048)
-
-
-@pytest.mark.parametrize(("heavier", "stronger"), [(0.5, 1.0), (3.0, 3.0), (36.0, 0.04 / 0.0048)])
-def test_probe_is_as_strong_as_the_mass_that_is_found_wants(
-    heavier: float, stronger: float
-) -> None:
-    """It moves nobody by more, and pushes with 0.04 N·m at the most; it stays about the path."""
-    regression, wall = made(), np.zeros(1, WALL)
-    wall["y"], wall["v"] = 0.01, -0.5
-    regression["way"] = -0.5 * PERIOD
-    torques = np.empty(40)
-    for j in range(len(torques)):
-        found = LIGHTEST if j < 6 else heavier * LIGHTEST
-        torques[j] = probe(regression[0], wall[0], found, True)
-    np.testing.assert_allclose(np.abs(torques[:8]), 0.0048)
-    np.testing.assert_allclose(np.abs(torques[8:]), stronger * 0.0048)
-    v = np.cumsum(torques) * PERIOD
-    assert np.ptp(v[8:]) == pytest.approx(4.0 * PERIOD * stronger * 0.0048)
-    assert np.max(v[8:]) == pytest.approx(-np.min(v[8:]))
 
 
 def test_torque_after_an_old_sample_acts_earlier() -> None:
