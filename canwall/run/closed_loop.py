@@ -184,6 +184,14 @@ def simulate(
     return SimulatedRun(rows[:done], loop.units, trip, signals[0, :done], lag)
 
 
+def make_simulated_cycle(settings: Settings) -> NDArray[np.void]:
+    """Return the record of the wall of a configuration on its simulated drive (`make_cycle`)."""
+    units = simulated_units(settings)
+    limit_nm = cached_servo_scales(settings).torque_limit_per_mille * units.nm_per_mille
+    setup = DriveSetup(units, 0, _TPDO, _RPDO, torque_limit_nm=limit_nm)
+    return make_cycle(settings, setup, run_laws(settings))
+
+
 class ClosedLoop:
     """Cycle, servo and hand of a configuration, to be simulated with one wall or several."""
 
@@ -202,9 +210,7 @@ class ClosedLoop:
             raise ConfigError("schedule, wall.alternate: only a run can change its wall")
         scales = cached_servo_scales(settings)
         self.units = simulated_units(settings)
-        limit_nm = scales.torque_limit_per_mille * self.units.nm_per_mille
-        setup = DriveSetup(self.units, 0, _TPDO, _RPDO, torque_limit_nm=limit_nm)
-        self._cycle = make_cycle(settings, setup, run_laws(settings))
+        self._cycle = make_simulated_cycle(settings)
         self._servo = make_servo(simulation, scales.counts_per_rev)
         start_at(self._cycle, int(self._servo["latched_counts"][0]))
         self._cycle["phase"] = Phase.ENABLING

@@ -1,5 +1,6 @@
 """Continuous referent of a configuration (`analysis.referent`), with the simulated hand."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,9 @@ from canwall.analysis import AskedWall, ReferentInputs, follow_referent
 from canwall.analysis.felt import felt_body
 from canwall.compiled import copied
 from canwall.config import Settings, Simulation
+from canwall.cycle import stiffest_for
 from canwall.physics import make_plant
+from canwall.run.closed_loop import make_simulated_cycle
 
 Array = NDArray[np.float64]
 
@@ -33,7 +36,8 @@ def referent_motion(
     """Return the motion of the continuous referent of a run.
 
     The referent is the same hand with the same script on the same handle, against the continuous
-    wall at which the law aims in each cycle.
+    wall at which the law aims in each cycle; one with a cap is no stiffer than shaft, delay and
+    encoder bear (`stiffest_for`).
 
     Args:
         settings: Configuration of the run.
@@ -46,8 +50,19 @@ def referent_motion(
     """
     if settings.simulation is None or (settings.real_time and not settings.embedded):
         return None
+    most = np.where(asked.cap > 0.0, _stiffest(settings, settings.simulation), math.inf)
+    asked = asked._replace(stiffness=np.minimum(asked.stiffness, most))
     referent = Referent(settings, settings.simulation, len(wall_position))
     return referent.motion(asked, wall_position)
+
+
+def _stiffest(settings: Settings, simulation: Simulation) -> float:
+    """Return the stiffness of the stiffest capped wall that shaft, delay and encoder bear."""
+    capped = next((stage.wall for stage in settings.stages if stage.wall.cap), None)
+    if capped is None:
+        return math.inf
+    cycle = make_simulated_cycle(settings.model_copy(update={"wall": capped}))
+    return stiffest_for(cycle, simulation.inertia_kg_m2 + simulation.hand.inertia_kg_m2)
 
 
 class Referent:

@@ -1,6 +1,7 @@
 """The referent moves what the simulated drive moves: without a wall they are one."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -80,6 +81,34 @@ def test_damping_and_cap_are_those_of_the_mass_that_moves() -> None:
     exact = solve_ivp(motion, (0.0, t[-1]), (0.0, 0.0), t_eval=t, rtol=1e-9, max_step=1e-4).y[0]
     np.testing.assert_allclose(found.y, exact, atol=1e-6)
     assert found.y.min() < press / stiffness  # it overshoots: it is not overdamped
+
+
+@pytest.mark.parametrize(
+    ("keys", "stiffest"),
+    [
+        ({"simulation.objects": {"0x608F:01": 10_000}}, 2.2 * 0.08 / (2.0 * math.pi / 10_000)),
+        ({"estimator.delay_cycles": 2.0}, 0.83 * (1.85 / 2.5) ** 5 * 1.64e-4 / 1e-6),
+        ({}, 0.83 * (1.85 / 1.5) ** 5 * 1.64e-4 / 1e-6),
+    ],
+)
+def test_capped_wall_is_as_stiff_as_encoder_and_delay_bear(
+    keys: dict[str, Any], stiffest: float
+) -> None:
+    """2.2 N a count, and 0.83·(1.85/D)⁵·m/T²; walls without a cap are as asked."""
+    estimator = {"force_walk_nm_per_sqrt_s": None, "delay_margin_cycles": 0.5}
+    capped = {f"estimator.{key}": value for key, value in estimator.items()}
+    settings = settings_with(capped | {"wall.law": "mean_force", "wall.cap": 40.0} | keys)
+    n = 1500
+    each, position = np.ones(n), np.zeros(n)
+    motions = []
+    for asked, cap in ((5000.0, 40.0), (stiffest, 40.0), (stiffest, 0.0), (5000.0, 0.0)):
+        wall = AskedWall(asked * each, 0.0 * each, 0.5 * each, cap * each)
+        found = referent_motion(settings, wall, position)
+        assert found is not None
+        motions.append(found.y)
+    np.testing.assert_allclose(motions[0], motions[1], rtol=0.0, atol=1e-12)
+    np.testing.assert_array_equal(motions[1], motions[2])
+    assert np.abs(motions[2] - motions[3]).max() > 1e-4
 
 
 def test_hand_of_a_drive_elsewhere_has_no_known_begin_in_measured_time() -> None:
