@@ -164,10 +164,13 @@ def wait_for(condition: Callable[[], bool]) -> None:
         time.sleep(0.01)
 
 
-def torque_is_on(bus_log: Path) -> bool:
-    """Return True once the log has an RPDO with a torque of the wall; that of a probe is 8 ‰."""
+def torque_is_on(bus_log: Path, above: int = 16) -> bool:
+    """Return True once the log has an RPDO with a torque of the wall, above some ‰.
+
+    A probe has 8 ‰, and up to 63 ‰ where a hand that is not known comes fast.
+    """
     sent = (bytes.fromhex(word[8:12].decode()) for word in _enabling_rpdos(bus_log))
-    return any(abs(int.from_bytes(torque, "little", signed=True)) > 16 for torque in sent)
+    return any(abs(int.from_bytes(torque, "little", signed=True)) > above for torque in sent)
 
 
 def is_enabled(bus_log: Path) -> bool:

@@ -85,8 +85,8 @@ class Person:
             return list(csv.DictReader(file))
 
     def is_pressed(self, run: str) -> None:
-        """Wait until the wall has given torque."""
-        wait_for(lambda: torque_is_on(self.folder / run / "bus.log"))
+        """Wait until the wall has given torque, more than any probe."""
+        wait_for(lambda: torque_is_on(self.folder / run / "bus.log", above=64))
 
 
 @pytest.fixture
