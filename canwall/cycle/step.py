@@ -35,6 +35,7 @@ from canwall.walls import (
     put_in_force,
     set_applied_force,
     set_pace,
+    spread_in_force,
     stand_still,
     start_lagging,
     stiffest,
@@ -390,7 +391,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
         compare_position(cycle, cycle.counts - before, missed)
         if cycle.compares_lag:
             _compare_lag(cycle)
-        spread = cycle.bank[0].spread
+        spread = spread_in_force(cycle.bank[0])
         sample = at_sync(cycle.latch[0], estimator, spread, cycle.j, cycle.oriented)
         correct(estimator, sample)
         if cycle.bank[0].count > 0:

@@ -35,6 +35,7 @@ from canwall.walls.probe import (
 )
 from canwall.walls.regression import (
     HAND_RATE,
+    KNOWN_SPREAD,
     OBSERVER_SLOWER_BEHIND_SHAFT,
     REGRESSION,
     begin_regression,
@@ -161,8 +162,8 @@ _LANDING_S, _PRESSED, _SLOW = 0.04, 4, 0.38
 _EQUAL_SAMPLES = 32.0
 #: Relative change of the bandwidth that is worth other gains.
 _WORTH = 0.015
-#: Deviation of ln(mass) below which the mass counts as known.
-_KNOWN_SPREAD = 0.2
+#: Deviation of ln(mass) below which the mass counts as found.
+_FOUND_SPREAD = 0.2
 #: Lightest mass that explains the motion of a hand that is known, over the one told.
 _KNOWN_LIGHTEST = 0.5
 #: Growth in a period of ln(mass) once it was known and no longer is, while the torque rises: a hand
@@ -213,7 +214,9 @@ def set_bank(
     bank["landing"] = round(_LANDING_S / period)
     told = delay - margin
     bank["delay"], bank["told"] = delay, told
-    lightest = float(masses[0]) * (_KNOWN_LIGHTEST if n == 1 else 1.0)
+    lightest = float(masses[0])
+    if n == 1 and shaft is None:
+        lightest *= _KNOWN_LIGHTEST
     set_regression(bank["regression"][0, 0], lightest, period, count, told, shaft)
     slower = 1 if shaft is None else OBSERVER_SLOWER_BEHIND_SHAFT
     set_probe(bank["probe"][0, 0], lightest, period, count, slower)
@@ -446,7 +449,7 @@ def _follow(bank: Record, rises: bool) -> bool:
         # Rotor and load together.
         likeliest /= 1.0 + bank.regression[0].rotor * likeliest
     step = _FOLLOWED * (_place_of(bank, likeliest) - bank.place)
-    if bank.spread < _KNOWN_SPREAD:
+    if bank.spread < _FOUND_SPREAD:
         bank.known = True
     elif bank.known:
         step = min(step, _GROWTH_IN_DOUBT / bank.log_step if rises else 0.0)
@@ -493,6 +496,12 @@ def stiffest(bank: Record) -> float:
 
 
 @compiled
+def spread_in_force(bank: Record) -> float:
+    """Return the standard deviation of ln(mass) in force; 0: nothing is known of it."""
+    return KNOWN_SPREAD if bank.count <= 1 else bank.spread
+
+
+@compiled
 def doubt(bank: Record) -> float:
     """Return the doubt about the mass in force and, in motion, about the delay, from 0 to 1.
 
@@ -503,8 +512,8 @@ def doubt(bank: Record) -> float:
     regression = bank.regression[0]
     if regression.rotor > 0.0:
         return 0.0
-    of_mass = 0.0 if bank.holds else bank.spread
-    if of_mass == 0.0 and not bank.holds:
+    of_mass = spread_in_force(bank)
+    if of_mass == 0.0:
         return 1.0
     of_delay = 0.0
     if bank.lively_left > 0:
@@ -567,7 +576,7 @@ def with_probe(bank: Record, wall: Record, force: float) -> float:
     """Return the force of a law, and where that is zero the torque of a probe, unless it holds."""
     probe, regression = bank.probe[0], bank.regression[0]
     if force == 0.0 and not bank.holds:
-        known = 0.0 < bank.spread < _KNOWN_SPREAD
+        known = 0.0 < bank.spread < _FOUND_SPREAD
         return probe_torque(probe, wall, regression.way, comes(regression), bank.mass, known)
     probe.samples = 0
     return force

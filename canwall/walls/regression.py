@@ -115,7 +115,7 @@ _PRIOR_LIGHTNESS, _PRIOR_RATE, _PRIOR_RATE_DEVIATION, _PRIOR_STEADY = 0.7, 100.0
 #: added to the deviation from one hand to the next [periods].
 _PRIOR_EXCESS, _MOST_EXCESS, _EXCESS_CHANGES = 0.3, 0.5, 0.05
 #: Standard deviation of ln(m) of a hand that is known.
-_KNOWN = 0.01
+KNOWN_SPREAD = 0.01
 #: Coulomb friction that there may be: standard deviation, and the most that explains a surprise
 #: [N·m].
 _FRICTION = 0.02
@@ -479,7 +479,7 @@ def solve(regression: Record, mass: float) -> tuple[float, float]:
 def solve_for_delay(regression: Record, mass: float) -> None:
     """Find the delay as `solve` does, with a hand that is known."""
     mass -= regression.rotor
-    _set_normal(regression, mass, (mass / _KNOWN) ** 2, mass)
+    _set_normal(regression, mass, (mass / KNOWN_SPREAD) ** 2, mass)
     _find_delay(regression, 1.0 / mass)
 
 

@@ -163,8 +163,11 @@ def test_doubt_is_the_deviation_of_the_mass() -> None:
     assert doubt(bank[0]) == bank["spread"][0] < 0.2
     bank["spread"] = 3.0
     assert doubt(bank[0]) == 1.0
-    bank["holds"] = True
-    assert doubt(bank[0]) == 0.0
+    # Of a mass that is held it stays, and one that is told has little.
+    bank["holds"], bank["spread"] = True, 0.3
+    assert doubt(bank[0]) == 0.3
+    bank["count"] = 1
+    assert doubt(bank[0]) == 0.01
 
 
 @pytest.mark.parametrize("mass", [4.2e-4, 3.5e-3])
