@@ -99,10 +99,9 @@ class Estimator(Section):
     """`[estimator]`: the Kalman filter.
 
     Attributes:
-        force_walk_nm_per_sqrt_s: Random walk of the operator's force. Default: so much that the
-            filter of the lightest hand is nearly as quick as the delay is short, and that those of
-            others are as quick as encoder, wall and friction let them. With a value and without
-            operator.adapt it is a plain Kalman filter.
+        force_walk_nm_per_sqrt_s: Random walk of the operator's force in a plain Kalman filter, for
+            a hand that is known, in place of a filter that is as quick as delay, encoder, wall and
+            friction let it. Without operator.adapt only.
         delay_cycles: Delay D from the sampling of a position until the torque computed from it
             takes effect, in cycles. Default: 1 with synchronous PDOs; measured with others.
         delay_margin_cycles: What the model of the laws has more than that: too little delay costs
@@ -126,7 +125,8 @@ class Operator(Section):
     """`[operator]`: the hand at the handle, identified in the cycle from the wall's own torques.
 
     Attributes:
-        adapt: Identify it. [mechanics] is then the drive with its handle, without a hand.
+        adapt: Identify it. [mechanics] is then the drive with its handle, without a hand. False:
+            it is with the hand, and one filter holds its mass.
         lightest_kg_m2: Inertia of drive, handle and hand to begin with. Default: that of
             [mechanics].
         heaviest_kg_m2: Largest inertia of drive, handle and hand. Default: 4.4e-3 more than the

@@ -39,6 +39,7 @@ from canwall.walls import (
     set_plant,
     set_referent,
     stiffest_wall,
+    stiffest_walls,
 )
 
 #: Largest number of laws in a run.
@@ -213,7 +214,7 @@ def make_cycle(settings: Settings, setup: DriveSetup, laws: Sequence[Law]) -> ND
     set_limits(cycle, settings.limits)
     set_guard(cycle["guard"][0], settings.guard.action, period, setup.units.rad_per_count)
     mass, viscous, spring = _model(settings)
-    if _has_bank(settings):
+    if _plain_walk(settings) is None:
         masses, dampings = _hands(settings)
         mass, viscous = masses[0], dampings[0]
     set_plant(cycle["rendered"][0]["wall"][0], mass, viscous, spring, period)
@@ -248,9 +249,9 @@ def modelled_delay(settings: Settings) -> float:
     return delay
 
 
-def _has_bank(settings: Settings) -> bool:
-    """Return False for the filter of a hand that is known, whose random walk is given."""
-    return settings.operator.adapt or settings.estimator.force_walk_nm_per_sqrt_s is None
+def _plain_walk(settings: Settings) -> float | None:
+    """Return the random walk of the force in a plain filter, None where there is a bank."""
+    return None if settings.operator.adapt else settings.estimator.force_walk_nm_per_sqrt_s
 
 
 def _hands(settings: Settings) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -274,7 +275,7 @@ def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None
     """Reset the estimator for a delay of `delay` periods, and its margin. Raises ValueError."""
     margin = settings.estimator.delay_margin_cycles
     if margin is None:
-        margin = _DELAY_MARGIN if _has_bank(settings) else 0.0
+        margin = _DELAY_MARGIN if _plain_walk(settings) is None else 0.0
     margin = max(min(margin, MAX_DELAY - delay), 0.0)
     delay += margin
     mass, viscous, spring = _model(settings)
@@ -283,14 +284,12 @@ def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None
     shaft = _shaft(settings)
     cycle["shaft"] = shaft or 0.0
     bandwidth = _FILTER_PART * 2.0 * math.pi * shaft.resonance_hz if shaft else math.inf
-    force_walk = settings.estimator.force_walk_nm_per_sqrt_s
-    if _has_bank(settings):
+    force_walk = _plain_walk(settings)
+    if force_walk is None:
         masses, dampings = _hands(settings)
         mass, viscous, coulomb = masses[0], dampings[0], 0.0
         bandwidth = min(bandwidth, lightest_bandwidth(delay, period))
-    if force_walk is None:
         force_walk = force_walk_of(bandwidth, mass, period, abs(count))
-    if _has_bank(settings):
         set_bank(
             cycle["bank"][0],
             masses,
@@ -302,7 +301,7 @@ def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None
             delay,
             shaft,
             margin,
-            settings.mechanics.handle_radius_m or HANDLE_RADIUS_M,
+            _radius(settings),
         )
     set_estimator(
         cycle["estimator"][0],
@@ -319,6 +318,10 @@ def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None
     set_latch(cycle["latch"][0, 0], period, settings.drive.drive_cycle_s, count)
     _bound_stiffness(cycle)
     _reset(cycle, float(cycle["oriented"][0]))
+
+
+def _radius(settings: Settings) -> float:
+    return settings.mechanics.handle_radius_m or HANDLE_RADIUS_M
 
 
 def _shaft(settings: Settings) -> ElasticShaft | None:
@@ -364,16 +367,22 @@ def _bound_stiffness(cycle: NDArray[np.void]) -> None:
         wall["stiffest"] = np.interp(bank["place"], np.arange(n), bank["stiffest"][:n])
 
 
-def stiffest_for(cycle: NDArray[np.void], mass: float) -> float:
+def stiffest_for(cycle: NDArray[np.void], settings: Settings, mass: float) -> float:
     """Return the stiffness of the stiffest wall in a hand, inf where nothing bounds it.
 
     Args:
         cycle: An array of dtype CYCLE, shape (1,).
-        mass: Inertia of all that moves [kg·m²].
+        settings: Those of which it was made.
+        mass: Inertia of all that moves [kg·m²]; on an elastic shaft without operator.adapt it is
+            taken for the one told.
     """
     bank, wall = cycle["bank"][0, 0], cycle["rendered"][0, 0]["wall"]
     if not (wall["cap"][0] and (n := bank["count"].item())):
         return float(wall["stiffest"][0])
+    if n == 1 and not settings.mechanics.shaft_hz:
+        period, count = cycle["period"].item(), cycle["rad_per_count"].item()
+        masses, delay, radius = np.array([mass]), bank["delay"].item(), _radius(settings)
+        return float(stiffest_walls(masses, delay, period, count, radius)[0])
     log_masses = bank["log_lightest"] + bank["log_step"] * np.arange(n)
     return float(np.interp(math.log(mass), log_masses, bank["stiffest"][:n]))
 

@@ -11,7 +11,7 @@ from canwall.analysis import AskedWall, ReferentInputs, follow_referent
 from canwall.analysis.felt import felt_body
 from canwall.compiled import copied
 from canwall.config import Settings, Simulation
-from canwall.cycle import stiffest_for
+from canwall.cycle import set_delay, stiffest_for
 from canwall.physics import make_plant
 from canwall.run.closed_loop import make_simulated_cycle
 
@@ -31,18 +31,19 @@ class ReferentMotion(NamedTuple):
 
 
 def referent_motion(
-    settings: Settings, asked: AskedWall, wall_position: Array
+    settings: Settings, asked: AskedWall, wall_position: Array, delay: float | None = None
 ) -> ReferentMotion | None:
     """Return the motion of the continuous referent of a run.
 
     The referent is the same hand with the same script on the same handle, against the continuous
     wall at which the law aims in each cycle; one with a cap is no stiffer than shaft, delay and
-    encoder bear (`stiffest_for`).
+    encoder bear (`stiffest_for`; on an elastic shaft with the law and damping of the first wall).
 
     Args:
         settings: Configuration of the run.
         asked: The wall that is asked for in each cycle.
         wall_position: Position of the wall in each cycle [rad], shape (n,).
+        delay: Delay D that the laws were told [periods]. Default: as configured.
 
     Returns:
         The motion; None without `[simulation]`, as a person's hand is not known, and in measured
@@ -50,19 +51,22 @@ def referent_motion(
     """
     if settings.simulation is None or (settings.real_time and not settings.embedded):
         return None
-    most = np.where(asked.cap > 0.0, _stiffest(settings, settings.simulation), math.inf)
-    asked = asked._replace(stiffness=np.minimum(asked.stiffness, most))
+    if np.any(asked.cap > 0.0):
+        stiffest = _stiffest(settings, settings.simulation, float(asked.cap.max()), delay)
+        most = np.where(asked.cap > 0.0, stiffest, math.inf)
+        asked = asked._replace(stiffness=np.minimum(asked.stiffness, most))
     referent = Referent(settings, settings.simulation, len(wall_position))
     return referent.motion(asked, wall_position)
 
 
-def _stiffest(settings: Settings, simulation: Simulation) -> float:
+def _stiffest(settings: Settings, simulation: Simulation, cap: float, delay: float | None) -> float:
     """Return the stiffness of the stiffest capped wall that shaft, delay and encoder bear."""
-    capped = next((stage.wall for stage in settings.stages if stage.wall.cap), None)
-    if capped is None:
-        return math.inf
+    capped = settings.wall.model_copy(update={"cap": cap})
     cycle = make_simulated_cycle(settings.model_copy(update={"wall": capped}))
-    return stiffest_for(cycle, simulation.inertia_kg_m2 + simulation.hand.inertia_kg_m2)
+    if delay is not None:
+        set_delay(cycle, settings, delay)
+    mass = simulation.inertia_kg_m2 + simulation.hand.inertia_kg_m2
+    return stiffest_for(cycle, settings, mass)
 
 
 class Referent:

@@ -112,7 +112,10 @@ def write_result(
 def judged(signals: "pa.Table", settings: Settings, units: DriveUnits) -> dict[str, Any]:
     """Return what the summary has from the rows, judged against the continuous referent."""
     asked = AskedWall(*(numbers(signals, name) for name in AskedWall._fields))
-    referent = referent_motion(settings, asked, numbers(signals, "wall_position_rad"))
+    # When the wall begins it has been measured, if it is to be, and nothing has been found yet.
+    begin = int(np.argmax(numbers(signals, "phase") == Phase.RENDERING))
+    told = float(numbers(signals, "delay_est")[begin])
+    referent = referent_motion(settings, asked, numbers(signals, "wall_position_rad"), told)
     found = summarise(signals, settings, units, *((None, None) if referent is None else referent))
     return found | {"motion_delay_cycles": _delay_of(signals)}
 

@@ -35,7 +35,7 @@ NAMED = {
     "counts": ("1", "encoder increments per turn, 0x608F"),
     "torque_step": ("N*m", "a thousandth of the rated torque, 0x6076"),
     "operator": ("", "operator at the handle"),
-    "model": ("", "model of the laws: matched (it does not adapt), drive, file"),
+    "model": ("", "model of the laws: matched (it knows the hand), drive, file"),
     "model_error": ("1", "relative error of the model's inertia"),
     "servo": ("", "file: as configured; ideal: as with simulation.ideal; 1600Hz, 800Hz: real ones"),
     "friction": ("N*m", "Coulomb friction; 1.5 times as much holds at rest"),

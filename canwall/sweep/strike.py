@@ -275,8 +275,8 @@ class PreparedStrike:
                 for value in (None, None, wall.damping_ratio, wall.cap)
             )
         )
-        #: On an elastic shaft the referent is no stiffer than the law aims at.
-        self._stiffest = stiffest_for(self._loop.cycle, self.mass)
+        #: The referent is no stiffer than shaft, delay and encoder bear.
+        self._stiffest = stiffest_for(self._loop.cycle, settings, self.mass)
         self._band = felt_band(settings.bus.cycle_s)
         self._radius = settings.mechanics.handle_radius_m or HANDLE_RADIUS_M
         self._by_frames = through == "bus"

@@ -47,7 +47,6 @@ from canwall.walls.regression import (
     reset_regression,
     set_regression,
     solve,
-    solve_for_delay,
     torque_rises,
 )
 from canwall.walls.shaft import ElasticShaft
@@ -419,7 +418,8 @@ def _identify(bank: Record, estimator: Record, y_sample: float) -> bool:
         if not learned:
             return False
         if bank.holds:
-            solve_for_delay(regression, bank.mass)
+            if bank.count == 1:
+                solve(regression, bank.mass, True)
             return False
         return _follow(bank, torque_rises(regression, estimator))
     bank.at_rest += 1
@@ -443,7 +443,7 @@ def _follow(bank: Record, rises: bool) -> bool:
 
     rises: True if the torque does.
     """
-    likeliest, deviation = solve(bank.regression[0], bank.mass)
+    likeliest, deviation = solve(bank.regression[0], bank.mass, False)
     bank.spread = deviation / max(likeliest, deviation)
     if likeliest > 0.0:
         # Rotor and load together.
@@ -484,7 +484,9 @@ def _place_of(bank: Record, likeliest: float) -> float:
 @compiled
 def _in_force(bank: Record, of_filters: NDArray[np.float64]) -> float:
     """Return a quantity between those of the two filters next to the mass in force."""
-    k = min(int(bank.place), max(bank.count - 2, 0))
+    if bank.count == 1:
+        return of_filters[0]
+    k = min(int(bank.place), bank.count - 2)
     share = bank.place - k
     return of_filters[k] + share * (of_filters[k + 1] - of_filters[k])
 
@@ -513,7 +515,7 @@ def doubt(bank: Record) -> float:
     if regression.rotor > 0.0:
         return 0.0
     of_mass = spread_in_force(bank)
-    if of_mass == 0.0:
+    if of_mass == 0.0 and not bank.holds:
         return 1.0
     of_delay = 0.0
     if bank.lively_left > 0:

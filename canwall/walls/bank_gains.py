@@ -38,18 +38,18 @@ _LIVELY_N = 2.2
 #: a soft wall noise is felt less, and a filter slower than the wall makes a heavy hand bounce.
 STEADIEST, _QUICKENING, _SOFTEST = 1.0, 1.0 / 6.0, 16.0
 #: Bandwidth of a filter for a handle at rest without damping, as a part of that for one in motion,
-#: and rate b/m at which both are the same [1/s]. Friction adds damping, the more the smaller the
-#: motion: a loop that some damping makes unstable goes on swinging in friction, as that of a quick
-#: filter does with a mass that has little damping of its own.
+#: and rate b/m from which on both are the same [1/s]. Friction adds damping, the more the smaller
+#: the motion: a loop that some damping makes unstable goes on swinging in friction, as that of a
+#: quick filter does with a mass that has little damping of its own.
 _CALM, _DAMPED = 0.75, 60.0
 #: Mass over the lightest one up to which filters follow how the push changes, and their bandwidth
 #: on the way to the wall, over that of the lightest one in contact.
 _LIGHT, _IN_FLIGHT = 3.0, 0.9
+#: How quickly they follow it in contact, as a part of how quickly they do in flight.
+_IN_CONTACT = 0.3
 #: Mass over the lightest one from which on doubt about the delay counts in full. A light hand would
 #: swing under the damping.
 _DELAY_COUNTS = 10.0
-#: How quickly they follow it in contact, as a part of how quickly they do in flight.
-_IN_CONTACT = 0.3
 #: Share of half a count within which a reading does not contradict the prediction of a heavy hand,
 #: whose motion between two samples is known better than that. A light one needs each correction.
 _WITHIN = 0.8
@@ -136,11 +136,10 @@ def set_filters(
         _set_filter(bank, i, kalman_model(*plant, count, walk))
         _set_paces(bank, i, plant, count, walk, lively / slower, rigid)
         _set_torques(bank, i, *plant)
-        if len(masses) == 1:
-            # The lightest that there may be is not known: as the encoder lets filters be quick.
-            heavier = _LIGHT / felt_less
-        bank["delay_counts"][i] = min(max(math.log(heavier) / math.log(_DELAY_COUNTS), 0.0), 1.0)
-        if rigid and heavier <= _LIGHT:
+        # Of a single one the lightest is not known: it is as light as the encoder lets it be quick.
+        lightness = 1.0 / heavier if len(masses) > 1 else felt_less / _LIGHT
+        bank["delay_counts"][i] = min(max(-math.log(lightness) / math.log(_DELAY_COUNTS), 0.0), 1.0)
+        if rigid and _LIGHT * lightness >= 1.0:
             in_flight = _IN_FLIGHT * lightest_bandwidth(bank["told"].item(), period)
             bank["gain_in_flight"][:, i] = gain = gain_with_trend(*plant, in_flight)
             bank["trend_gain"][i] = _IN_CONTACT * gain[3] / gain[2]

@@ -457,42 +457,20 @@ def _forget(regression: Record, left: float) -> None:
 
 
 @compiled
-def solve(regression: Record, mass: float) -> tuple[float, float]:
+def solve(regression: Record, mass: float, known: bool) -> tuple[float, float]:
     """Return 1/m, of the load on an elastic shaft, and its standard deviation; find the delay.
 
     They are the least squares of r₀ + r₁·(1/m) − r₂·(b/m) − r₃·(f_c/m) + r₄·(δ/m) − r₅·c, with what
     is known before the first torque; c is what is steady. mass: the one in force, for friction and
-    delay.
+    delay. known: True if it is that of a hand that is known; any error of it is found as delay.
     """
-    lightest, normal = regression.lightest, regression.normal
-    _set_normal(regression, mass - regression.rotor, (lightest / _PRIOR_LIGHTNESS) ** 2, lightest)
-    told = normal[4, 4]
-    precision = normal[1, 1] - normal[1, 4] * normal[1, 4] / told
-    lightness = -(normal[0, 1] - normal[1, 4] * normal[0, 4] / told) / precision
-    deviation = 1.0 / math.sqrt(precision)
-    if lightness > 0.0:
-        _find_delay(regression, lightness)
-    return mean_above_zero(lightness, deviation), deviation
-
-
-@compiled
-def solve_for_delay(regression: Record, mass: float) -> None:
-    """Find the delay as `solve` does, with a hand that is known."""
     mass -= regression.rotor
-    _set_normal(regression, mass, (mass / KNOWN_SPREAD) ** 2, mass)
-    _find_delay(regression, 1.0 / mass)
-
-
-@compiled
-def _set_normal(regression: Record, mass: float, precision: float, known: float) -> None:
-    """Set up the normal equations of 1/m and δ/m.
-
-    mass: the one in force, of the load on an elastic shaft. precision: that of 1/m as it is known
-    before, 1/known.
-    """
+    before, deviation = regression.lightest, _PRIOR_LIGHTNESS
+    if known:
+        before, deviation = mass, KNOWN_SPREAD
     normal = regression.normal
     normal[:] = regression.information
-    _add_knowledge(normal, 1, precision, 1.0 / known)
+    _add_knowledge(normal, 1, (before / deviation) ** 2, 1.0 / before)
     _add_knowledge(normal, 2, 1.0 / _PRIOR_RATE_DEVIATION**2, -_PRIOR_RATE)
     _add_knowledge(normal, 3, (mass / _FRICTION) ** 2, 0.0)
     precision, excess = regression.excess_before[0], regression.excess_before[1]
@@ -501,17 +479,15 @@ def _set_normal(regression: Record, mass: float, precision: float, known: float)
     _eliminate(normal, 5)
     _eliminate(normal, 3)
     _eliminate(normal, 2)
-
-
-@compiled
-def _find_delay(regression: Record, lightness: float) -> None:
-    """Find the delay from the normal equations and 1/m; on an elastic shaft it is as told."""
-    if regression.rotor > 0.0:
-        return
-    normal = regression.normal
-    excess = -(normal[0, 4] + normal[1, 4] * lightness) / (normal[4, 4] * lightness)
-    regression.excess = min(max(excess, -_MOST_EXCESS), _MOST_EXCESS)
-    regression.excess_spread = _excess_spread(regression, lightness)
+    told = normal[4, 4]
+    precision = normal[1, 1] - normal[1, 4] * normal[1, 4] / told
+    lightness = -(normal[0, 1] - normal[1, 4] * normal[0, 4] / told) / precision
+    deviation = 1.0 / math.sqrt(precision)
+    if lightness > 0.0 and regression.rotor == 0.0:
+        excess = -(normal[0, 4] + normal[1, 4] * lightness) / (told * lightness)
+        regression.excess = min(max(excess, -_MOST_EXCESS), _MOST_EXCESS)
+        regression.excess_spread = _excess_spread(regression, lightness)
+    return mean_above_zero(lightness, deviation), deviation
 
 
 @compiled

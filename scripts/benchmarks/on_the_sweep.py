@@ -71,8 +71,8 @@ def unknown_hand() -> dict[str, Any]:
     time, in turns, in µs.
     """
     servo = {"servo": "1600Hz", "model": "drive", "operator": "grip"}
-    full = _loop("mean_force", guard="act", adapt=True, **servo)
-    settings = _settings("mean_force", guard="act", adapt=True, **servo)
+    full = _loop("mean_force", guard="act", hand="identified", **servo)
+    settings = _settings("mean_force", guard="act", hand="identified", **servo)
     counts = simulate(settings, _STRIKE).rows["counts"]
     cycles = [
         ClosedLoop(one, _STRIKE).records().cycle
@@ -113,7 +113,8 @@ def safeguards() -> dict[str, Any]:
         own.write_text(_OWN_LAW)
         pairs = {
             "guard": (_loop("half_sample"), _loop("half_sample", guard="act")),
-            "operator identified": (_loop("half_sample"), _loop("half_sample", adapt=True)),
+            "hand known": (_loop("half_sample"), _loop("half_sample", hand="known")),
+            "hand identified": (_loop("half_sample"), _loop("half_sample", hand="identified")),
             "one TPDO in ten missing": (_loop("half_sample"), _loop("half_sample", lost=0.1)),
             "law of one's own": (_loop("standard"), _loop(f"{own}:own")),
         }
@@ -151,9 +152,9 @@ def _computed(work: Callable[[], object]) -> float:
 
 
 def _loop(
-    law: str, guard: str = "off", adapt: bool = False, lost: float = 0.0, **axes: Any
+    law: str, guard: str = "off", hand: str = "", lost: float = 0.0, **axes: Any
 ) -> Callable[[], object]:
-    settings = _settings(law, guard, adapt, **axes)
+    settings = _settings(law, guard, hand, **axes)
     disturbances = Disturbances.none(_STRIKE)
     disturbances.lost[10:] = np.random.default_rng(0).random(_STRIKE - 10) < lost
     records = ClosedLoop(settings, _STRIKE, disturbances=disturbances).records()
@@ -166,12 +167,12 @@ def _loop(
     return strikes
 
 
-def _settings(law: str, guard: str = "off", adapt: bool = False, **axes: Any) -> Any:
+def _settings(law: str, guard: str = "off", hand: str = "", **axes: Any) -> Any:
+    """Return the settings of a strike; hand: known or identified, else the filter is a plain one."""
     settings = _struck(law, **axes)
     given = settings.guard.model_copy(update={"action": guard})
-    operator = settings.operator.model_copy(update={"adapt": adapt})
-    # Without, a plain filter: that of a known hand is a bank of one.
-    walk = {} if adapt else {"force_walk_nm_per_sqrt_s": 0.2}
+    operator = settings.operator.model_copy(update={"adapt": hand == "identified"})
+    walk = {} if hand else {"force_walk_nm_per_sqrt_s": 0.2}
     estimator = settings.estimator.model_copy(update=walk)
     update = {"guard": given, "operator": operator, "estimator": estimator}
     return settings.model_copy(update=update)

@@ -335,9 +335,11 @@ def test_guard_and_identification_change_in_a_run(attended: Callable[..., Attend
         }
     )
     masses: dict[int, float] = {}
+    delays: dict[int, float] = {}
 
     def at(j: int) -> bool:
         masses[j] = float(run.axis.cycle["estimator"]["mass"][0, 0])
+        delays[j] = float(run.axis.cycle["bank"]["delay_in_force"][0, 0])
         return False
 
     requests: dict[int, Request] = {
@@ -350,6 +352,8 @@ def test_guard_and_identification_change_in_a_run(attended: Callable[..., Attend
     assert masses[230] > 1.2e-4
     # Between the strikes it would begin with the lightest hand again.
     assert {masses[j] for j in range(232, 800)} == {masses[231]}
+    # A delay found with a mass that is another hand's would be wrong.
+    assert {delays[j] for j in range(232, 750)} == {delays[231]}
     assert masses[900] != masses[231]
     assert masses[900] == pytest.approx(1.64e-4, rel=0.4)
     assert run.axis.cycle["guard"]["action"][0, 0] == 0

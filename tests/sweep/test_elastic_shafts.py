@@ -10,14 +10,15 @@ from canwall.sweep.plan import compute_piece
 
 
 @pytest.mark.slow
-def test_cap_keeps_every_wall_quiet_on_an_elastic_shaft() -> None:
+@pytest.mark.parametrize(("model", "softest"), [("drive", 0.5), ("matched", 0.25)])
+def test_cap_keeps_every_wall_quiet_on_an_elastic_shaft(model: str, softest: float) -> None:
     """Seeded strikes of all operators; without a bound by the shaft, most of them chatter."""
     asked = np.random.default_rng(14).uniform(30.0, 5000.0, 3).round()
     plan = make_plan(
         config.load(SIM_CONFIG),
         {
             "operator": list(OPERATORS),
-            "model": "drive",
+            "model": model,
             "servo": "1600Hz",
             "friction": 0.01,
             "simulation.shaft_hz": [400.0, 250.0],
@@ -31,6 +32,6 @@ def test_cap_keeps_every_wall_quiet_on_an_elastic_shaft() -> None:
     assert measured.shape == (12, 3)
     assert not measured["chatters"].any()
     in_force = measured["stiffness_in_force"]
-    assert (in_force > 0.5).all()
+    assert (in_force > softest).all()
     # The softer shaft bears less, in every hand.
     assert (in_force[1::2] < in_force[::2]).all()

@@ -58,6 +58,20 @@ def test_known_hand_is_no_worse_than_an_unknown_one(operator: str, delay_error: 
     assert np.concatenate(found)["chatters"].sum() <= (2 if operator == "arm" else 0)
 
 
+def test_known_hand_s_wall_is_as_stiff_as_encoder_and_delay_bear() -> None:
+    """2.2 N a count at 80 mm, and 0.83·(1.85/D)⁵·m/T² at D = 2, 0.35 of the servo and 0.1."""
+    settings = config.load(config.shipped("config/sim.toml"), {"wall.cap": 1.0})
+    strike = {"law": "mean_force", "model": "matched", "servo": "1600Hz", "operator": "arm"}
+    strike |= {"friction": 0.0, "speed": 0.5, "phase": 0.0, "press": 1.2, "stiffness": 5000.0}
+    for axes, stiffest in (
+        ({"counts": 10_000}, 2.2 * 0.08 * 10_000 / (2.0 * np.pi)),
+        ({"delay": 2.0}, 0.83 * (1.85 / 2.45) ** 5 * 3.62e-3 / 1e-6),
+    ):
+        plan = make_plan(settings.model_copy(update={"sweep": {}}), strike | axes)
+        found = plan.prepare(plan.points[0], plan.strikes[0]).on(5000.0, 0.0)
+        assert found["stiffness_in_force"] == pytest.approx(stiffest, rel=2e-3)
+
+
 def test_known_hand_under_a_plain_filter_is_worse_than_an_unknown_one() -> None:
     """The random walk of the source text is for an ideal servo."""
     plain = {"estimator__force_walk_nm_per_sqrt_s": 0.2}

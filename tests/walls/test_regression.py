@@ -35,7 +35,7 @@ def made() -> NDArray[np.void]:
 
 
 def mass_known(regression: NDArray[np.void], before: float) -> float:
-    return 1.0 / max(solve(regression[0], before)[0], 200.0)
+    return 1.0 / max(solve(regression[0], before, False)[0], 200.0)
 
 
 def send(regression: NDArray[np.void], estimator: NDArray[np.void], torque: float) -> None:
@@ -59,7 +59,7 @@ def play(
         send(regression, estimator, torque)
         a = (torque + pushed - 0.01 * v) / mass
         y, v = y + PERIOD * v + 0.5 * PERIOD**2 * a, v + PERIOD * a
-    return solve(regression[0], known)
+    return solve(regression[0], known, False)
 
 
 @pytest.mark.parametrize("counts", [10_000, 32_768, 131_072])
@@ -212,7 +212,7 @@ def test_swing_against_friction_tells_the_mass(mass: float) -> None:
     for j in range(200):
         torque = 250.0 * mass * math.sin(2.0 * math.pi * j / 10.0)
         learn(regression[0], estimator[0], COUNT * round(y / COUNT), known, False, False)
-        found, deviation = solve(regression[0], known)
+        found, deviation = solve(regression[0], known, False)
         known = 1.0 / max(found, 200.0)
         send(regression, estimator, torque)
         y, v, _ = advance(plant[0], y, v, torque, 0.0, PERIOD)

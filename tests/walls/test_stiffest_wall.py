@@ -145,10 +145,10 @@ def test_regression_finds_the_load_behind_the_shaft(load: float, hz: float) -> N
         reset_regression(regression[0], 0.0)
         x = np.array([0.0, -2.0, 0.0, -2.0])
         for torque in torques.tolist():
-            mass = 1.0 / max(solve(regression[0], 3e-4)[0], 200.0) + regression["rotor"][0]
+            mass = 1.0 / max(solve(regression[0], 3e-4, False)[0], 200.0) + regression["rotor"][0]
             learn(regression[0], estimator[0], COUNT * round(x[0] / COUNT), mass, False, False)
             send(regression, estimator, torque)
             x = phi @ x + gamma * torque
-        found.append(1.0 / solve(regression[0], 3e-4)[0])
+        found.append(1.0 / solve(regression[0], 3e-4, False)[0])
     assert found[0] == pytest.approx(load, rel=0.25)
     assert abs(found[1] / (load + ROTOR) - 1.0) > abs(found[0] / load - 1.0)
