@@ -168,7 +168,7 @@ def _loop(
 
 
 def _settings(law: str, guard: str = "off", hand: str = "", **axes: Any) -> Any:
-    """Return the settings of a strike; hand: known or identified, else the filter is a plain one."""
+    """Return the settings of a strike; hand: known, identified, or "" for a plain filter."""
     settings = _struck(law, **axes)
     given = settings.guard.model_copy(update={"action": guard})
     operator = settings.operator.model_copy(update={"adapt": hand == "identified"})
