@@ -129,7 +129,7 @@ def test_torque_moves_the_handle_by_as_much(drive: Drive, make_rig: RigFactory) 
 
 
 def test_strikes_come_out_as_on_our_own_drive(drive: Drive, make_rig: RigFactory) -> None:
-    # What a hand tells of mass and delay depends on the steps of the torque, which one drive has its
+    # What a hand tells of mass and delay depends on the steps of the torque, and one drive has its
     # own: there nothing is to be found.
     steps = drive.name == "ingenia"
     plain = {"operator__adapt": False, "estimator__force_walk_nm_per_sqrt_s": 0.2} if steps else {}
