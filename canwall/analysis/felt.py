@@ -31,6 +31,11 @@ HANDLE_RADIUS_M = 0.08
 _ORDER = 2
 
 
+def handle_radius(given: float | None) -> float:
+    """Return the radius of the handle [m]: HANDLE_RADIUS_M where the configuration gives none."""
+    return given or HANDLE_RADIUS_M
+
+
 class FeltBand(NamedTuple):
     """Band-pass filter in second-order sections, in the form that compiled code takes.
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from canwall.analysis.felt import HANDLE_RADIUS_M
+from canwall.analysis.felt import handle_radius
 from canwall.analysis.metrics import STRIKE_GAP_S
 from canwall.config import ConfigError, Guard, Limits, Operator, Settings, Wall
 from canwall.cycle.guard import GUARD, change_guard, set_guard
@@ -301,7 +301,7 @@ def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None
             delay,
             shaft,
             margin,
-            _radius(settings),
+            handle_radius(settings.mechanics.handle_radius_m),
         )
     set_estimator(
         cycle["estimator"][0],
@@ -318,10 +318,6 @@ def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None
     set_latch(cycle["latch"][0, 0], period, settings.drive.drive_cycle_s, count)
     _bound_stiffness(cycle)
     _reset(cycle, float(cycle["oriented"][0]))
-
-
-def _radius(settings: Settings) -> float:
-    return settings.mechanics.handle_radius_m or HANDLE_RADIUS_M
 
 
 def _shaft(settings: Settings) -> ElasticShaft | None:
@@ -381,8 +377,9 @@ def stiffest_for(cycle: NDArray[np.void], settings: Settings, mass: float) -> fl
         return float(wall["stiffest"][0])
     if n == 1 and not settings.mechanics.shaft_hz:
         period, count = cycle["period"].item(), cycle["rad_per_count"].item()
-        masses, delay, radius = np.array([mass]), bank["delay"].item(), _radius(settings)
-        return float(stiffest_walls(masses, delay, period, count, radius)[0])
+        radius = handle_radius(settings.mechanics.handle_radius_m)
+        delay = bank["delay"].item()
+        return float(stiffest_walls(np.array([mass]), delay, period, count, radius)[0])
     log_masses = bank["log_lightest"] + bank["log_step"] * np.arange(n)
     return float(np.interp(math.log(mass), log_masses, bank["stiffest"][:n]))
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.analysis import metrics
-from canwall.analysis.felt import HANDLE_RADIUS_M, band_rms, felt_band
+from canwall.analysis.felt import band_rms, felt_band, handle_radius
 from canwall.record import ROW, Phase
 
 #: Time over which chatter and felt ripple are judged [s].
@@ -195,7 +195,7 @@ class ContactMeter:
         ripple = math.nan
         if len(y) == self._length and touched[0] == slice(0, len(y)):
             felt = band_rms(self._band, np.ascontiguousarray(force), len(y) // 2, len(y))
-            ripple = felt / (scale.handle_radius_m or HANDLE_RADIUS_M)
+            ripple = felt / handle_radius(scale.handle_radius_m)
         tolerance = metrics.amplitude_tolerance(
             float(self._last["stiffness"][0]), scale.count_rad, scale.torque_step_nm
         )

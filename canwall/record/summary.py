@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.analysis import metrics
-from canwall.analysis.felt import HANDLE_RADIUS_M, band_rms, felt_band
+from canwall.analysis.felt import band_rms, felt_band, handle_radius
 from canwall.analysis.strike import SPAN, first_bounce, first_depth, least_in_contact, pressed_cycle
 from canwall.config import Settings
 from canwall.record.columns import Phase
@@ -169,7 +169,7 @@ def _in_force(
 
 def _felt(force: Array, start: int, first: int, last: int, settings: Settings) -> float:
     """Return the r.m.s. of a force in the felt band over [first, last), at the handle [N]."""
-    radius = settings.mechanics.handle_radius_m or HANDLE_RADIUS_M
+    radius = handle_radius(settings.mechanics.handle_radius_m)
     band = felt_band(settings.bus.cycle_s)
     return band_rms(band, force[start:last], first - start, last - start) / radius
 

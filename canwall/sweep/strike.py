@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.analysis import AskedWall, ReferentInputs, follow_referent
-from canwall.analysis.felt import HANDLE_RADIUS_M, FeltBand, felt_band
+from canwall.analysis.felt import HANDLE_RADIUS_M, FeltBand, felt_band, handle_radius
 from canwall.analysis.strike import MEASURES, measure_strike
 from canwall.compiled import Record, compiled
 from canwall.config import ConfigError, Hand, Mechanics, Settings, Simulation
@@ -278,7 +278,7 @@ class PreparedStrike:
         #: The referent is no stiffer than shaft, delay and encoder bear.
         self._stiffest = stiffest_for(self._loop.cycle, settings, self.mass)
         self._band = felt_band(settings.bus.cycle_s)
-        self._radius = settings.mechanics.handle_radius_m or HANDLE_RADIUS_M
+        self._radius = handle_radius(settings.mechanics.handle_radius_m)
         self._by_frames = through == "bus"
         self.law = named_law(settings)
 
