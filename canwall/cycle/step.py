@@ -414,7 +414,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     if cycle.frozen and cycle.frozen < cycle.stuck_cycles:
         predict_open_loop(estimator, sent)
     excess = cycle.bank[0].regression[0].excess
-    expect_torques(cycle.latch[0], estimator, estimator.told + excess, cycle.j, sent)
+    expect_torques(cycle.latch[0], estimator, estimator.told + excess, sent)
     if cycle.bank[0].count > 0:
         predict_bank(cycle.bank[0], estimator, sent, age_at(cycle.latch[0], cycle.j))
     predict(estimator, sent)

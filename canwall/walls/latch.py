@@ -4,9 +4,10 @@ A drive whose control cycle T_c runs on its own crystal answers a SYNC with the 
 tick, up to T_c ago. Where the SYNC's period is no multiple of T_c, that age changes from sample to
 sample: at 1 rad/s by 0.2 mrad for T_c = 0.4 ms, eight counts of a 17-bit encoder, which a filter
 takes for motion. A torque waits for a tick as well: where a position was old, the torque of the
-SYNC before acts as much earlier. The pattern is known, a sawtooth at T/T_c, and its phase follows
-from a handle that moves. Of the sawtooth the first harmonic is taken; its mean age is part of the
-delay.
+SYNC before acts as much earlier. The pattern is known, a sawtooth at T/T_c; its phase is not, and
+follows from a handle that moves: of each of a number of phases it is weighed how well it explains
+the samples. The age is the mean of all phases by that weight; without a motion it is none beyond
+the sawtooth's mean, which is part of the delay.
 """
 
 import math
@@ -16,45 +17,51 @@ import numpy as np
 from canwall.compiled import Record, compiled
 from canwall.walls.estimator import MAX_DELAY, unit_motion
 
+#: Phases of the ticks that are weighed.
+PHASES = 16
+
 #: Ticks of a drive against the SYNC.
 LATCH = np.dtype(
     [
-        ("turn", "f8"),  # of the ticks against the SYNC in a period [rad]; 0: always alike
+        ("turn", "f8"),  # of the ticks against the SYNC in a period [ticks]; 0: always alike
+        ("tick", "f8"),  # T_c [periods]
         ("period", "f8"),
         ("resolution", "f8"),  # one count [rad]
-        ("prior", "f8"),
         ("received", "i8"),  # samples in a row, up to those of a second difference
         ("j", "i8"),  # cycle of the last one
         ("samples", "f8", (2,)),  # the last ones, newest first [rad]
-        # The way of a period [counts] times cosine and sine of the ticks, at these samples.
-        ("turned", "f8", (2, 2)),
+        ("ways", "f8", (2,)),  # of a period, at these samples [counts]
         # For a unit mass under the torques, the part of its next second difference that the last
-        # period made, and the second difference; how later torques change both, times cosine and
-        # sine of the ticks.
+        # period made, and the second difference; the same that torques change of them which are
+        # later by a period, of the second difference those of the last period and those before.
         ("begun", "f8"),
         ("bend", "f8"),
-        ("later_begun", "f8", (2,)),
+        ("later_begun", "f8"),
         ("later", "f8", (2,)),
-        # Of least squares for the ages' cosine and sine: products of what both change, (0, 0),
-        # (0, 1), (1, 1), and their products with what the samples were late.
-        ("information", "f8", (3,)),
-        ("told", "f8", (2,)),
-        ("age", "f8", (2,)),  # cosine and sine of the age beyond its mean [periods]
+        # Of each phase: what ages change in the second difference, what of it is steady, which no
+        # age is [counts], and the weight; the weights' sum is 1.
+        ("expected", "f8", (PHASES,)),
+        ("steady", "f8", (PHASES,)),
+        ("weight", "f8", (PHASES,)),
     ],
     align=True,
 )
 
 #: Part of a turn from one SYNC to the next below which the age counts as constant.
 _LEAST_TURN = 0.02
-#: Share of what is known that is left after a sample that tells of the age, and after one that does
-#: not: crystals drift, and the sawtooth jumps.
-_MEMORY, _MEMORY_AT_REST = 0.97, 0.995
+#: Share of what is known that is lost with a sample that tells of the phase, and with one that does
+#: not: crystals drift.
+_LOST, _LOST_AT_REST = 0.005, 0.001
 #: Samples of a second difference.
 _SAMPLES = 3
-#: What an age of a period would change in a second difference for the sample to tell of it, beyond
-#: a multiple of what torques do: at rest they answer the steps of the encoder, which would look
-#: like an age. [counts]
-_TELLING, _OF_TORQUES = 4.0, 1.5
+#: What phases differ by in a second difference for the sample to tell of them [counts], beyond a
+#: multiple of what torques do in it that are later by T_c: at rest they answer the steps of the
+#: encoder, which would look like an age.
+_TELLING, _OF_TORQUES = 1.0, 0.75
+#: Share of what is left of a second difference that counts as steady: the operator's push.
+_FOLLOWED = 0.6
+#: Variance of a second difference, but for that by the doubt about the mass [counts²].
+_VARIANCE = 1.0
 #: Way in a period below which a sample is as good at any age [counts].
 _LEAST_WAY = 2.0
 
@@ -69,18 +76,16 @@ def set_latch(latch: np.void, period: float, drive_cycle: float, count: float) -
         count: One count of the encoder [rad].
     """
     turn = math.remainder(period / drive_cycle, 1.0) if drive_cycle else 0.0
-    latch["turn"] = 2.0 * math.pi * turn if abs(turn) >= _LEAST_TURN else 0.0
+    latch["turn"] = turn if abs(turn) >= _LEAST_TURN else 0.0
+    latch["tick"] = drive_cycle / period
     latch["period"], latch["resolution"] = period, abs(count)
-    # A count of noise, and an age evenly distributed over the cycle.
-    latch["prior"] = 12.0 * (period / drive_cycle) ** 2 if drive_cycle else 0.0
 
 
 def reset_latch(latch: np.void) -> None:
     """Begin with nothing known of the ticks."""
-    for name in ("received", "samples", "turned", "information", "told", "age"):
+    for name in ("received", "samples", "ways", "begun", "bend", "later_begun", "later", "steady"):
         latch[name] = 0
-    for name in ("begun", "bend", "later_begun", "later"):
-        latch[name] = 0.0
+    latch["weight"] = 1.0 / PHASES
 
 
 @compiled
@@ -93,7 +98,7 @@ def at_sync(latch: Record, estimator: Record, spread: float, j: int, y_sample: f
     if latch.turn == 0.0:
         return y_sample
     way = estimator.v * latch.period
-    _learn(latch, estimator.mass, spread, j, y_sample, way)
+    _learn(latch, estimator, spread, j, y_sample, way)
     if abs(way) < _LEAST_WAY * latch.resolution:
         return y_sample
     return y_sample + way * age_at(latch, j)
@@ -104,12 +109,21 @@ def age_at(latch: Record, j: int) -> float:
     """Return the age of the sample of cycle j beyond the mean [periods]."""
     if latch.turn == 0.0:
         return 0.0
-    angle = latch.turn * j
-    return latch.age[0] * math.cos(angle) + latch.age[1] * math.sin(angle)
+    age = 0.0
+    for k in range(PHASES):
+        age += latch.weight[k] * _age(latch, k, j)
+    return age
 
 
 @compiled
-def expect_torques(latch: Record, estimator: Record, delay: float, j: int, force: float) -> None:
+def _age(latch: Record, k: int, j: int) -> float:
+    """Return the same if the ticks have phase k: a sawtooth."""
+    ticks = (k + 0.5) / PHASES + latch.turn * j
+    return (ticks - math.floor(ticks) - 0.5) * latch.tick
+
+
+@compiled
+def expect_torques(latch: Record, estimator: Record, delay: float, force: float) -> None:
     """Note what the torques of the coming period do; call before `predict` of the estimator.
 
     force: as in `predict`. delay: D [periods].
@@ -119,53 +133,57 @@ def expect_torques(latch: Record, estimator: Record, delay: float, j: int, force
     delay = min(max(delay, 0.0), float(MAX_DELAY))
     t = latch.period
     way, speed, later_way, later_speed = unit_motion(estimator.in_flight, force, delay, t)
-    angle = latch.turn * j
-    cosine, sine = math.cos(angle), math.sin(angle)
     latch.bend = latch.begun + way
     latch.begun = t * speed - way
-    begun = t * later_speed - later_way
-    latch.later[0] = latch.later_begun[0] + later_way * cosine
-    latch.later[1] = latch.later_begun[1] + later_way * sine
-    latch.later_begun[0], latch.later_begun[1] = begun * cosine, begun * sine
+    latch.later[0], latch.later[1] = later_way, latch.later_begun
+    latch.later_begun = t * later_speed - later_way
 
 
 @compiled
-def _learn(latch: Record, mass: float, spread: float, j: int, y_sample: float, way: float) -> None:
-    """Learn from the second difference of the samples, less what torques explain of it."""
-    samples, turned, count = latch.samples, latch.turned, latch.resolution
+def _learn(
+    latch: Record, estimator: Record, spread: float, j: int, y_sample: float, way: float
+) -> None:
+    """Weigh the phases by the second difference of the samples, less what forces explain of it."""
+    samples, ways, t, count = latch.samples, latch.ways, latch.period, latch.resolution
     latch.received = min(latch.received + 1, _SAMPLES) if j == latch.j + 1 else 1
     latch.j = j
-    angle = latch.turn * j
-    c, s = way * math.cos(angle) / count, way * math.sin(angle) / count
+    way /= count
     if latch.received == _SAMPLES:
-        bend = latch.bend / (mass * count)
+        unit = 1.0 / (estimator.mass * count)  # from a unit mass to the handle, in counts
+        bend = latch.bend * unit
         late = (2.0 * samples[0] - y_sample - samples[1]) / count + bend
-        u = c - 2.0 * turned[0, 0] + turned[1, 0] + latch.later[0] / (mass * count)
-        v = s - 2.0 * turned[0, 1] + turned[1, 1] + latch.later[1] / (mass * count)
-        torques = abs(bend) + (abs(latch.later[0]) + abs(latch.later[1])) / (mass * count)
-        if math.hypot(u, v) >= _TELLING + _OF_TORQUES * torques:
-            doubt = bend * (spread if spread > 0.0 else 1.0)
-            _add_information(latch, _MEMORY, 1.0 / (1.0 + doubt * doubt), u, v, late)
-        else:
-            _add_information(latch, _MEMORY_AT_REST, 0.0, u, v, late)
+        late += t * t * estimator.d * unit
+        # What an age at this sample, the one before and the one before that changes.
+        before = latch.later[0] * unit - 2.0 * ways[0]
+        earlier = latch.later[1] * unit + ways[1]
+        least, most = math.inf, -math.inf
+        for k in range(PHASES):
+            expected = way * _age(latch, k, j) + before * _age(latch, k, j - 1)
+            expected += earlier * _age(latch, k, j - 2)
+            latch.expected[k] = expected
+            least, most = min(least, expected), max(most, expected)
+        torques = abs(bend) + (abs(latch.later[0]) + abs(latch.later[1])) * unit
+        tells = most - least >= _TELLING + _OF_TORQUES * latch.tick * torques
+        doubt = bend * (spread if spread > 0.0 else 1.0)
+        _weigh(latch, late, _VARIANCE + doubt * doubt, tells)
     samples[1], samples[0] = samples[0], y_sample
-    for i in range(2):
-        turned[1, i] = turned[0, i]
-    turned[0, 0], turned[0, 1] = c, s
+    ways[1], ways[0] = ways[0], way
 
 
 @compiled
-def _add_information(
-    latch: Record, memory: float, weight: float, u: float, v: float, late: float
-) -> None:
-    """Add that cosine times u and sine times v of the age made a sample late; find the age."""
-    information, told = latch.information, latch.told
-    information[0] = memory * information[0] + weight * u * u
-    information[1] = memory * information[1] + weight * u * v
-    information[2] = memory * information[2] + weight * v * v
-    told[0] = memory * told[0] + weight * u * late
-    told[1] = memory * told[1] + weight * v * late
-    a, b, d = information[0] + latch.prior, information[1], information[2] + latch.prior
-    determinant = a * d - b * b
-    latch.age[0] = (d * told[0] - b * told[1]) / determinant
-    latch.age[1] = (a * told[1] - b * told[0]) / determinant
+def _weigh(latch: Record, late: float, variance: float, tells: bool) -> None:
+    """Weigh the phases by what they leave of a second difference; follow what of it is steady.
+
+    The likelihood is Cauchy's: forces and ways are known from a model that may be wrong.
+    """
+    lost = _LOST if tells else _LOST_AT_REST
+    total = 0.0
+    for k in range(PHASES):
+        left = late - latch.expected[k] - latch.steady[k]
+        latch.steady[k] += _FOLLOWED * left
+        if tells:
+            latch.weight[k] /= 1.0 + left * left / variance
+        total += latch.weight[k]
+    for k in range(PHASES):
+        weight = latch.weight[k] / total
+        latch.weight[k] = weight + lost * (1.0 / PHASES - weight)

@@ -61,10 +61,13 @@ def test_age_that_alternates_is_found(phase: float) -> None:
     assert rms(found) < 0.4
 
 
-@pytest.mark.parametrize("drive_cycle", [0.0003, 0.0006, 0.0007])
-def test_first_harmonic_of_any_age_is_found(drive_cycle: float) -> None:
-    raw, found = errors(drive_cycle)
-    assert rms(found) < 0.75 * rms(raw)
+@pytest.mark.parametrize("phase", [0.05, 0.3, 0.62])
+@pytest.mark.parametrize("drive_cycle", [0.0003, 0.00045, 0.0006, 0.0007, 0.0013])
+def test_any_age_is_found(drive_cycle: float, phase: float) -> None:
+    """Of a tick next to a SYNC it is open on which side it was."""
+    raw, found = errors(drive_cycle, phase)
+    assert np.median(np.abs(found)) < 0.8
+    assert rms(found) < 0.6 * rms(raw)
 
 
 def test_lost_samples_do_not_turn_the_ticks() -> None:
@@ -112,25 +115,30 @@ def ages(drive_cycle: float, phase: float, n: int) -> Array:
     return np.asarray(old - old[1:].mean())
 
 
+@pytest.mark.parametrize("drive_cycle", [0.0004, 0.00045, 0.0007])
 @pytest.mark.parametrize("phase", [0.1, 0.6])
-def test_age_is_found_under_torques(phase: float) -> None:
-    """They move the handle, and each acts as much earlier as the position was old."""
-    latch, estimator = made(0.0004)
-    handle = Handle(0.0004, phase, 1.0)
-    true = ages(0.0004, phase, 60)
+def test_age_is_found_under_torques(drive_cycle: float, phase: float) -> None:
+    """They move the handle, and each acts as much earlier as the position was old.
+
+    A later SYNC would make all of them as much older, and be seen in none.
+    """
+    latch, estimator = made(drive_cycle)
+    handle = Handle(drive_cycle, phase, 1.0)
+    true, found = ages(drive_cycle, phase, 60), np.zeros(60)
     torques = 0.15 * np.sign(np.sin(1.2 * np.arange(60)))
     sent = [0.0, 0.0]
     for j, torque in enumerate(torques.tolist()):
         position = handle.until(j * PERIOD, sent[-2])
         estimator["v"] = handle.v
         at_sync(latch[0], estimator[0], 0.05, j, COUNT * round(position / COUNT))
-        if j > 30:
-            assert age_at(latch[0], j) == pytest.approx(true[j], abs=0.005), j
-        expect_torques(latch[0], estimator[0], 1.4, j, torque)
+        found[j] = age_at(latch[0], j)
+        expect_torques(latch[0], estimator[0], 1.0 + drive_cycle / PERIOD, torque)
         estimator["in_flight"][0] = np.roll(estimator["in_flight"][0], 1)
         estimator["in_flight"][0, 0] = torque
         sent.append(torque)
-    assert np.abs(true[1:]).min() > 0.09
+    missed = (found - true)[31:]
+    assert np.abs(missed - missed.mean()).max() < 0.025
+    assert np.ptp(true[1:]) > 0.19
 
 
 def test_torque_that_answers_the_encoder_looks_like_no_age() -> None:
@@ -140,15 +148,17 @@ def test_torque_that_answers_the_encoder_looks_like_no_age() -> None:
     samples = COUNT * rng.integers(0, 2, 2000)
     for j, sample in enumerate(samples.tolist()):
         at_sync(latch[0], estimator[0], 0.05, j, sample)
-        assert age_at(latch[0], j) == 0.0
+        assert abs(age_at(latch[0], j)) < 1e-12
         torque = -MASS / PERIOD**2 * sample
-        expect_torques(latch[0], estimator[0], 1.4, j, torque)
+        expect_torques(latch[0], estimator[0], 1.4, torque)
         estimator["in_flight"][0] = np.roll(estimator["in_flight"][0], 1)
         estimator["in_flight"][0, 0] = torque
 
 
 def test_samples_at_rest_are_left_alone() -> None:
     latch, estimator = made(0.0004)
-    latch["age"] = 0.1
+    latch["weight"] = 0.0
+    latch["weight"][0, 3] = 1.0
     estimator["v"] = 1.9 * COUNT / PERIOD
+    assert age_at(latch[0], 1) != 0.0
     assert at_sync(latch[0], estimator[0], 0.0, 1, 0.123) == 0.123
