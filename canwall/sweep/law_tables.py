@@ -45,11 +45,20 @@ _PRESS_S = 1.2
 CAPS = (0.5, 0.8, 1.0)
 DRAWS = 144
 _ASKED, _DRAWN_SPEEDS = (30.0, 5000.0), (0.2, 2.0)
+
+
+def _drive_cycle(cycle_s: float) -> dict[str, Sequence[float | str]]:
+    """Return the axes of a drive with this cycle of its own, which is known."""
+    return {"simulation.drive_cycle_s": (cycle_s,), "drive.drive_cycle_s": (cycle_s,)}
+
+
 #: Other benches: what is different, by axes, and the strikes that are drawn.
 BENCHES: dict[str, dict[str, Sequence[float | str]]] = {
     "as above": {},
     "torque on reception, $D = 0.4$": {"delay": (0.4,)},
     "two cycles to the torque, $D = 2$": {"delay": (2.0,)},
+    "drive cycle of 0.45 ms": _drive_cycle(0.00045),
+    "drive cycle of 0.6 ms": _drive_cycle(0.0006),
     "10 000 counts": {"counts": (10_000,)},
     "32 768 counts (15 bits)": {"counts": (32_768,)},
     "1 048 576 counts (20 bits)": {"counts": (1_048_576,)},
