@@ -257,7 +257,10 @@ def test_hub_owner_that_never_receives_stalls_nobody(join: Join) -> None:
     assert [number_of(hub.recv(0)) for _ in range(400)] == list(range(400))
 
 
-def test_participant_that_never_reads_loses_its_own_frames_only(join: Join) -> None:
+def test_participant_that_never_reads_loses_its_own_frames_only(
+    join: Join, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("canwall.bus.unixcan._SEND_BUFFER", 4 << 20)
     hub, sender, reader, deaf = join(), join(), join(), join()
     total = 0
     while hub.overruns == 0:
