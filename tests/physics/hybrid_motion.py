@@ -57,10 +57,6 @@ def thousandths(low: float, high: float) -> st.SearchStrategy[float]:
     return st.integers(round(low * 1000), round(high * 1000)).map(lambda n: n / 1000)
 
 
-def or_zero(low: float, high: float) -> st.SearchStrategy[float]:
-    return st.just(0.0) | thousandths(low, high)
-
-
 @dataclass
 class Reference:
     """End of the motion, and events on the way."""

@@ -5,9 +5,10 @@ from dataclasses import replace
 from itertools import pairwise
 
 import pytest
-from hybrid_motion import Handle, integrate, moved, or_zero, thousandths, touches
+from hybrid_motion import Handle, integrate, moved, thousandths, touches
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numbers_drawn import or_zero
 
 from canwall.physics import flow, make_plant
 
@@ -96,14 +97,14 @@ def test_every_combination_of_wall_and_friction(handle: Handle, u0: float, u1: f
 handles = st.builds(
     Handle,
     mass=thousandths(0.1, 10.0),
-    viscous=or_zero(0.01, 3.0),
-    spring=or_zero(0.1, 10.0),
-    coulomb=or_zero(0.01, 3.0),
-    wall_stiffness=or_zero(1.0, 300.0),
-    wall_damping=or_zero(0.01, 30.0),
+    viscous=or_zero(thousandths(0.01, 3.0)),
+    spring=or_zero(thousandths(0.1, 10.0)),
+    coulomb=or_zero(thousandths(0.01, 3.0)),
+    wall_stiffness=or_zero(thousandths(1.0, 300.0)),
+    wall_damping=or_zero(thousandths(0.01, 30.0)),
 )
-starts = st.tuples(thousandths(-1.0, 1.0), or_zero(-5.0, 5.0))
-forces = st.tuples(thousandths(-10.0, 10.0), or_zero(-5.0, 5.0))
+starts = st.tuples(thousandths(-1.0, 1.0), or_zero(thousandths(-5.0, 5.0)))
+forces = st.tuples(thousandths(-10.0, 10.0), or_zero(thousandths(-5.0, 5.0)))
 
 
 @BOUNDED

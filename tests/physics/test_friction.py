@@ -5,9 +5,10 @@ from dataclasses import astuple
 
 import numpy as np
 import pytest
-from hybrid_motion import Handle, moved, or_zero, thousandths
+from hybrid_motion import Handle, moved, thousandths
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numbers_drawn import or_zero
 from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
@@ -132,9 +133,9 @@ def test_a_ramp_that_began_on_the_threshold() -> None:
     st.builds(
         Handle,
         thousandths(0.01, 10.0),
-        or_zero(0.01, 1.0),
-        or_zero(0.01, 10.0),
-        or_zero(0.01, 2.0),
+        or_zero(thousandths(0.01, 1.0)),
+        or_zero(thousandths(0.01, 10.0)),
+        or_zero(thousandths(0.01, 2.0)),
     ),
     *[thousandths(-2.0, 2.0)] * 4,
 )

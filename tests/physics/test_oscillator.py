@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numbers_drawn import log_floats, or_zero
 from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.linalg import expm
@@ -20,15 +21,6 @@ BOUNDED = settings(derandomize=True, deadline=None, max_examples=200)
 ANGLES = (0.0, 1e-8, 1e-5, 1e-3, 0.1, 0.499, 0.501, 1.0, 3.0, math.pi, 4.0, 6.5, 20.0)
 #: Damping as a share of the critical: none, under, at and around the critical, far over.
 DAMPING = (0.0, 1e-9, 1e-3, 0.5, 1.0 - 1e-9, 1.0, 1.0 + 1e-9, 2.0, 50.0, 1000.0)
-
-
-def log_floats(low: float, high: float) -> st.SearchStrategy[float]:
-    """Positive numbers, every decade as likely."""
-    return st.floats(math.log10(low), math.log10(high)).map(lambda exponent: 10.0**exponent)
-
-
-def or_zero(numbers: st.SearchStrategy[float]) -> st.SearchStrategy[float]:
-    return st.just(0.0) | numbers
 
 
 amounts = st.floats(-10.0, 10.0)

@@ -1,10 +1,9 @@
 """One wall and one law without a loop: helpers shared by the tests of the laws."""
 
-import math
-
 import numpy as np
 from bouncing import Array
 from hypothesis import strategies as st
+from numbers_drawn import log_floats, or_zero
 from numpy.typing import NDArray
 
 from canwall.walls import (
@@ -65,15 +64,6 @@ def bounced_in_python(
         states.append((y, v))
     positions, velocities = np.array(states).T
     return positions, velocities, np.array(forces), np.array(absorbed)
-
-
-def log_floats(low: float, high: float) -> st.SearchStrategy[float]:
-    """Positive numbers, uniform in their logarithm."""
-    return st.floats(math.log10(low), math.log10(high)).map(lambda exponent: 10.0**exponent)
-
-
-def or_zero(numbers: st.SearchStrategy[float]) -> st.SearchStrategy[float]:
-    return st.just(0.0) | numbers
 
 
 @st.composite

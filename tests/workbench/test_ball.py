@@ -8,6 +8,7 @@ import pytest
 from bouncing import Array, bounces, integrated, sample_times, zoh_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numbers_drawn import log_floats, or_zero
 
 from canwall.errors import InputError
 from canwall.walls import LAWS
@@ -172,15 +173,6 @@ def test_referent_bounces_in_closed_form() -> None:
     middle = y[6::12]  # halfway it is deepest: static depth and amplitude together
     deepest = -1.0 / omega**2 - math.hypot(speed / omega, 1.0 / omega**2)
     assert middle == pytest.approx(np.full(50, deepest), abs=1e-12)
-
-
-def log_floats(low: float, high: float) -> st.SearchStrategy[float]:
-    """Positive numbers, every decade as likely."""
-    return st.floats(math.log10(low), math.log10(high)).map(lambda exponent: 10.0**exponent)
-
-
-def or_zero(numbers: st.SearchStrategy[float]) -> st.SearchStrategy[float]:
-    return st.just(0.0) | numbers
 
 
 def floats(low: float, high: float) -> st.SearchStrategy[float]:
