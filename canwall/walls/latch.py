@@ -5,9 +5,9 @@ tick, up to T_c ago. Where the SYNC's period is no multiple of T_c, that age cha
 sample: at 1 rad/s by 0.2 mrad for T_c = 0.4 ms, eight counts of a 17-bit encoder, which a filter
 takes for motion. A torque waits for a tick as well: where a position was old, the torque of the
 SYNC before acts as much earlier. The pattern is known, a sawtooth at T/T_c; its phase is not, and
-follows from a handle that moves: of each of a number of phases it is weighed how well it explains
-the samples. The age is the mean of all phases by that weight; without a motion it is none beyond
-the sawtooth's mean, which is part of the delay.
+follows from a handle that moves: phases are weighed by how well each explains the samples. The age
+is their weighted mean; while nothing is known it is the sawtooth's mean, which is part of the
+delay.
 """
 
 import math
@@ -32,14 +32,14 @@ LATCH = np.dtype(
         ("samples", "f8", (2,)),  # the last ones, newest first [rad]
         ("ways", "f8", (2,)),  # of a period, at these samples [counts]
         # For a unit mass under the torques, the part of its next second difference that the last
-        # period made, and the second difference; the same that torques change of them which are
-        # later by a period, of the second difference those of the last period and those before.
+        # period made, and the second difference; what torques that act a period later change: of
+        # the former, and of the latter those of the last period and those of the one before.
         ("begun", "f8"),
         ("bend", "f8"),
         ("later_begun", "f8"),
         ("later", "f8", (2,)),
-        # Of each phase: what ages change in the second difference, what of it is steady, which no
-        # age is [counts], and the weight; the weights' sum is 1.
+        # Of each phase: what ages change in the second difference, what is left of it all the
+        # time, which no age makes [counts], and the weight; the weights' sum is 1.
         ("expected", "f8", (PHASES,)),
         ("steady", "f8", (PHASES,)),
         ("weight", "f8", (PHASES,)),
@@ -58,7 +58,8 @@ _SAMPLES = 3
 #: multiple of what torques do in it that are later by T_c: at rest they answer the steps of the
 #: encoder, which would look like an age.
 _TELLING, _OF_TORQUES = 1.0, 0.75
-#: Share of what is left of a second difference that counts as steady: the operator's push.
+#: Share of what is left of a second difference that counts as left all the time: d̂ is behind of the
+#: operator's push.
 _FOLLOWED = 0.6
 #: Variance of a second difference, but for that by the doubt about the mass [counts²].
 _VARIANCE = 1.0
@@ -117,7 +118,7 @@ def age_at(latch: Record, j: int) -> float:
 
 @compiled
 def _age(latch: Record, k: int, j: int) -> float:
-    """Return the same if the ticks have phase k: a sawtooth."""
+    """Return the age of the sample of cycle j beyond the mean for phase k: a sawtooth [periods]."""
     ticks = (k + 0.5) / PHASES + latch.turn * j
     return (ticks - math.floor(ticks) - 0.5) * latch.tick
 
@@ -172,7 +173,7 @@ def _learn(
 
 @compiled
 def _weigh(latch: Record, late: float, variance: float, tells: bool) -> None:
-    """Weigh the phases by what they leave of a second difference; follow what of it is steady.
+    """Weigh the phases by what they leave of a second difference; follow what is always left.
 
     The likelihood is Cauchy's: forces and ways are known from a model that may be wrong.
     """
