@@ -64,27 +64,34 @@ def closed_loop() -> dict[str, Any]:
 
 
 def unknown_hand() -> dict[str, Any]:
-    """Time per period of the loop on a servo, and of the cycle alone with all that it may have.
+    """Time per period of the loop on two servos, and of the cycle alone with all that it may have.
 
-    The cycle alone gets the positions of a recorded strike: with the law `midpoint`, a few
-    multiplications, and with mean_force, the operator identified and the guard. By the processor's
-    time, in turns, in µs.
+    The second servo's own cycle does not go with the SYNC. The cycle alone gets the positions of a
+    recorded strike: with the law `midpoint`, a few multiplications, and with mean_force, the
+    operator identified and the guard. By the processor's time, in turns, in µs.
     """
     servo = {"servo": "1600Hz", "model": "drive", "operator": "grip"}
-    full = _loop("mean_force", guard="act", hand="identified", **servo)
-    settings = _settings("mean_force", guard="act", hand="identified", **servo)
+    all_of_it = {"guard": "act", "hand": "identified"}
+    full = _loop("mean_force", **all_of_it, **servo)
+    latching = _loop("mean_force", **all_of_it, **servo | {"servo": "800Hz"})
+    settings = _settings("mean_force", **all_of_it, **servo)
     counts = simulate(settings, _STRIKE).rows["counts"]
     cycles = [
         ClosedLoop(one, _STRIKE).records().cycle
         for one in (_settings("midpoint", **servo), settings)
     ]
-    works = [full, *(partial(_replay, cycle, np.zeros(1, ROW), counts) for cycle in cycles)]
+    works = [
+        full,
+        latching,
+        *(partial(_replay, cycle, np.zeros(1, ROW), counts) for cycle in cycles),
+    ]
     for work in works:
         work()
     found = np.array([[_computed(work) for work in works] for _ in range(_RATIOS)])
-    loop, plain, having = 1e6 * np.median(found, axis=0) / (_TURNS * _STRIKE)
+    loop, latches, plain, having = 1e6 * np.median(found, axis=0) / (_TURNS * _STRIKE)
     return {
         "loop_us": round(float(loop), 2),
+        "loop_with_ticks_of_the_drive_us": round(float(latches), 2),
         "cycle_us": round(float(plain), 3),
         "cycle_with_law_identification_and_guard_us": round(float(having), 3),
         "what_they_take_us": round(float(having - plain), 3),
