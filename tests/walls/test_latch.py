@@ -162,3 +162,19 @@ def test_samples_at_rest_are_left_alone() -> None:
     estimator["v"] = 1.9 * COUNT / PERIOD
     assert age_at(latch[0], 1) != 0.0
     assert at_sync(latch[0], estimator[0], 0.0, 1, 0.123) == 0.123
+
+
+@pytest.mark.parametrize("phase", [0.1, 0.6, 0.8])
+def test_push_that_the_model_does_not_know_looks_like_no_age(phase: float) -> None:
+    """It bends the way of a light handle from rest by more than an age does."""
+    drive_cycle, acceleration = 0.00045, 900.0
+    latch, estimator = made(drive_cycle)
+    true, found = ages(drive_cycle, phase, 10), np.zeros(10)
+    for j in range(10):
+        latched = j * PERIOD - true[j] * PERIOD
+        estimator["v"] = acceleration * j * PERIOD
+        sample = COUNT * round(0.5 * acceleration * latched**2 / COUNT)
+        at_sync(latch[0], estimator[0], 0.0, j, sample)
+        found[j] = age_at(latch[0], j)
+        expect_torques(latch[0], estimator[0], 1.0 + drive_cycle / PERIOD, 0.0)
+    assert np.abs((found - true)[4:]).mean() < 0.045
