@@ -103,10 +103,14 @@ def test_k_limits_are_those_of_a_sweep(tmp_path: Path, capsys: pytest.CaptureFix
 @pytest.mark.slow
 @pytest.mark.usefixtures("small")
 @pytest.mark.parametrize(
-    ("estimator", "failed"), [("", "[012] of 2"), ("force_walk_nm_per_sqrt_s = 0.2\n", "2 of 2")]
+    ("estimator", "fewest", "most"), [("", 0, 3), ("force_walk_nm_per_sqrt_s = 0.2\n", 6, 6)]
 )
 def test_cap_is_what_is_in_force(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], estimator: str, failed: str
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    estimator: str,
+    fewest: int,
+    most: int,
 ) -> None:
     """A grip of 4.2e-4 kg·m² on a wall that takes it for a free handle of 1e-4 kg·m².
 
@@ -117,9 +121,9 @@ def test_cap_is_what_is_in_force(
     assert run("sweep", file, "--table", "cap", "--operator", "grip") == 0
     head, *rows = rows_of(capsys.readouterr().out)
     assert head == ["", "grip"]
-    found = [row[1] for row in rows if "failed" in row[0]]
-    assert len(found) == len(law_tables.CAPS)
-    assert all(re.fullmatch(failed, of_cap) for of_cap in found)
+    failed = [row[1].split(" of ") for row in rows if "failed" in row[0]]
+    assert [strikes for _, strikes in failed] == ["2"] * len(law_tables.CAPS)
+    assert fewest <= sum(int(number) for number, _ in failed) <= most
     least = [float(row[1]) for row in rows if "least" in row[0]]
     assert least == pytest.approx([cap / 4.2 for cap in law_tables.CAPS], rel=5e-3)
 

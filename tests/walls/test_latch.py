@@ -49,6 +49,15 @@ def errors(
     return (samples - late)[kept] / COUNT, (found - late)[kept] / COUNT
 
 
+def send(
+    latch: NDArray[np.void], estimator: NDArray[np.void], drive_cycle: float, torque: float
+) -> None:
+    """Put a torque in flight, at the end of a cycle."""
+    expect_torques(latch[0], estimator[0], 1.0 + drive_cycle / PERIOD, torque)
+    estimator["in_flight"][0] = np.roll(estimator["in_flight"][0], 1)
+    estimator["in_flight"][0, 0] = torque
+
+
 def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
@@ -132,9 +141,7 @@ def test_age_is_found_under_torques(drive_cycle: float, phase: float) -> None:
         estimator["v"] = handle.v
         at_sync(latch[0], estimator[0], 0.05, j, COUNT * round(position / COUNT))
         found[j] = age_at(latch[0], j)
-        expect_torques(latch[0], estimator[0], 1.0 + drive_cycle / PERIOD, torque)
-        estimator["in_flight"][0] = np.roll(estimator["in_flight"][0], 1)
-        estimator["in_flight"][0, 0] = torque
+        send(latch, estimator, drive_cycle, torque)
         sent.append(torque)
     missed = (found - true)[31:]
     assert np.abs(missed - missed.mean()).max() < 0.025
@@ -150,9 +157,7 @@ def test_torque_that_answers_the_encoder_looks_like_no_age() -> None:
         at_sync(latch[0], estimator[0], 0.05, j, sample)
         assert abs(age_at(latch[0], j)) < 1e-12
         torque = -MASS / PERIOD**2 * sample
-        expect_torques(latch[0], estimator[0], 1.4, torque)
-        estimator["in_flight"][0] = np.roll(estimator["in_flight"][0], 1)
-        estimator["in_flight"][0, 0] = torque
+        send(latch, estimator, 0.0004, torque)
 
 
 def test_samples_at_rest_are_left_alone() -> None:
@@ -176,5 +181,5 @@ def test_push_that_the_model_does_not_know_looks_like_no_age(phase: float) -> No
         sample = COUNT * round(0.5 * acceleration * latched**2 / COUNT)
         at_sync(latch[0], estimator[0], 0.0, j, sample)
         found[j] = age_at(latch[0], j)
-        expect_torques(latch[0], estimator[0], 1.0 + drive_cycle / PERIOD, 0.0)
+        send(latch, estimator, drive_cycle, 0.0)
     assert np.abs((found - true)[4:]).mean() < 0.045
