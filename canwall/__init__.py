@@ -1,8 +1,8 @@
 """A virtual wall on an industrial servo drive over CANopen.
 
 What scripts and notebooks use is listed here; each name is imported at its first use, since a
-command should not wait for what it does not need. Everything else is in the rooms, `canwall.walls`,
-`canwall.analysis` …
+command should not wait for what it does not need. Everything else is in the packages,
+`canwall.walls`, `canwall.analysis` …
 """
 
 import importlib
@@ -67,10 +67,10 @@ def __dir__() -> list[str]:
 
 
 class _Library(ModuleType):
-    """This module. `canwall.run` and `canwall.sweep` are functions, and rooms are called the same.
+    """This module, in which `canwall.run` and `canwall.sweep` stay functions.
 
-    `from canwall.run import …` finds a room all the same. Python would bind a room to the name of
-    the function as soon as anything imports it.
+    Two packages have the same names, and `from canwall.run import …` still finds them; but Python
+    would bind a package to the name of the function as soon as anything imports it.
     """
 
     def __setattr__(self, name: str, value: object) -> None:

@@ -27,7 +27,7 @@ def limits_line(item: str, value: object) -> str:
         user = getpass.getuser()
     except (KeyError, OSError):  # a user without a name
         user = f":{os.getuid()}"
-    return f"in /etc/security/limits.conf, then log in anew: {user} - {item} {value}"
+    return f"in /etc/security/limits.conf, then log in again: {user} - {item} {value}"
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""The doctor: from an unknown drive to 'ready', or to a list of what has to be mended.
+"""The doctor: from an unknown drive to 'ready', or to a list of what to fix.
 
 Bus and nodes are looked at first. The drive is then identified, set up as for a run, enabled with
 zero torque, moved a little if that is asked for, and left alone to see its watchdog react. At the

@@ -124,7 +124,8 @@ law = "mean_force"
 side = "below"                 # the wall fills positions below (or "above")
 # A tenth of K = (b + b_h)/(T/2 + D·T), up to which the plain wall (standard) is stable, at the
 # worst delay, D = {WORST_DELAY} periods, in the lightest hand: b = 0, and b_h is that of a
-# fingertip, 2 N·s/m at a handle of {HANDLE_M * 1e3:.0f} mm. No law chatters; raise it step by step.
+# fingertip, 2 N·s/m at a handle of {HANDLE_M * 1e3:.0f} mm. No law chatters in any hand;
+# raise it step by step.
 stiffness_nm_per_rad = {stiffness}
 damping_ratio = 0.5
 cap = 0.8                      # the stiffness in force is at most cap·mass/cycle_s²

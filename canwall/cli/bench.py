@@ -38,7 +38,7 @@ def doctor(
     eds: EdsOption = None,
     accept_no_watchdog: NoWatchdogOption = False,
 ) -> int:
-    """Tell whether a bench is ready for a wall, or what has to be mended.
+    """Check whether a bench is ready for a wall, and say what to fix.
 
     Bus, drive, file, units, limits and timing are checked, and the watchdog is tested: the drive is
     enabled with zero torque. All changes are undone.

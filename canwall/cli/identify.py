@@ -23,7 +23,7 @@ from canwall.stopping import stop_on_signals
 def identify(
     config_file: ConfigArgument = None,
     hand: Annotated[
-        bool, typer.Option("--hand", help="Somebody holds the handle, and is what is identified.")
+        bool, typer.Option("--hand", help="Identify the person holding the handle.")
     ] = False,
     inertia: Annotated[
         float | None,

@@ -185,7 +185,7 @@ def change(
 def drive(
     config_file: ConfigArgument = None,
     real_time: Annotated[
-        bool, typer.Option("--real-time", help="Measured time instead of a period per SYNC.")
+        bool, typer.Option("--real-time", help="Run by the clock instead of one period per SYNC.")
     ] = False,
     eds: EdsOption = None,
     ready_fd: Annotated[

@@ -55,9 +55,9 @@ def sweep(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Print a Markdown table: laws (K-limits), cap, first-strike, or shaft; for laws "
-            "(--law) and operators (--operator; without: all). Its other axes are fixed; [sweep] "
-            "of CONFIG is ignored. With --output, the result is written as well.",
+            help="Print a Markdown table: laws (K-limits), cap, bench, first-strike, or shaft; for "
+            "laws (--law) and operators (--operator; without: all). Its other axes are fixed; "
+            "[sweep] of CONFIG is ignored. With --output, the result is written as well.",
         ),
     ] = None,
     as_json: JsonOption = False,

@@ -14,7 +14,7 @@ def _one_of_the_kinds(source: Any, handler: Any) -> core_schema.CoreSchema:
 
 
 class Fault(Section):
-    """One fault: its kind, its begin and duration, and what it touches.
+    """One fault: its kind, start, duration and target.
 
     Without at_s and at_sync it is present from power-on; without a duration it stays (`reboot`
     ends at once). docs/faults.md lists the kinds and their amounts.

@@ -2,7 +2,7 @@
 
 A drive whose control cycle T_c runs on its own crystal answers a SYNC with the position of its last
 tick, up to T_c ago. Where the SYNC's period is no multiple of T_c, that age changes from sample to
-sample: at 1 rad/s by 0.2 mrad for T_c = 0.4 ms, eight counts of a 17-bit encoder, which a filter
+sample: at 1 rad/s by 0.2 mrad for T_c = 0.4 ms, four counts of a 17-bit encoder, which a filter
 takes for motion. A torque waits for a tick as well: where a position was old, the torque of the
 SYNC before acts as much earlier. The pattern is known, a sawtooth at T/T_c; its phase is not, and
 follows from a handle that moves: phases are weighed by how well each explains the samples. The age

@@ -430,7 +430,7 @@ def _add_information(regression: Record, untimely: float, mass: float) -> None:
 
 @compiled
 def _let_push_change(regression: Record, mass: float) -> None:
-    """Let what is steady be another at the next sample, by a random walk.
+    """Let the steady term drift by a random walk until the next sample.
 
     A hand that begins to push while the wall does would look heavy. mass: the one in force.
     """

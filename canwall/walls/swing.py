@@ -1,6 +1,6 @@
 """The swing of a wall whose model is too light for the hand on it.
 
-With a finger's mass in its model the wall of an arm swings at 12 to 60 Hz, from nothing, and more
+With a finger's mass in its model the wall of an arm swings at 12 to 40 Hz, from nothing, and more
 and more. Until the swing is large, its torque changes no faster than that of a hand that pushes,
 and a light hand that pushes just so would make the wall answer with the same motion. But no hand
 pushes to and fro as fast: its own frequencies end below those of tremor (8 to 12 Hz). So a torque
