@@ -5,15 +5,18 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+#: Time without torque before a ramp: what begins sooner is a torque that passes through zero [s].
+_REST_S = 0.1
+
 
 def break_away(
     position: Array, torque: Array, period: float, step: float, inertia: float, delay: float
 ) -> tuple[Array, Array, Array]:
     """Return where and at which torque a handle at rest broke loose, in a record of slow ramps.
 
-    Each ramp begins at zero torque. A handle that has just broken loose under a torque that rises
-    with r needs (6·s·m/r)^⅓ for its first steps s, or less if friction falls: the torque is that
-    at the middle of this time before they were seen.
+    Each ramp begins after _REST_S without torque, and ends at zero torque. A handle that has just
+    broken loose under a torque that rises with r needs (6·s·m/r)^⅓ for its first steps s, or less
+    if friction falls: the torque is that at the middle of this time before they were seen.
 
     Args:
         position: Positions at the SYNCs [rad].
@@ -28,10 +31,15 @@ def break_away(
         for each ramp in which the handle broke loose.
     """
     found = []
-    starts = np.flatnonzero((torque[1:] != 0.0) & (torque[:-1] == 0.0))
-    for start, end in zip(starts, [*starts[1:], len(torque)], strict=True):
+    acts = torque != 0.0
+    rest_cycles = round(_REST_S / period)
+    for start in np.flatnonzero(acts[1:] & ~acts[:-1]).tolist():
+        if start + 1 < rest_cycles or acts[start + 1 - rest_cycles : start + 1].any():
+            continue
+        ends = np.flatnonzero(~acts[start + 1 :])
+        end = start + 1 + int(ends[0]) if len(ends) else len(torque)
         rest = position[start]
-        moved = np.flatnonzero(np.abs(position[start:end] - rest) > 3.0 * step)
+        moved = np.flatnonzero(np.abs(position[start : end + 1] - rest) > 3.0 * step)
         if not len(moved) or moved[0] < 2:
             continue
         at = start + int(moved[0])

@@ -23,7 +23,7 @@ _SEED = 402
 _TRAVEL, _SPEED, _TORQUE = 0.8, 0.5, 0.5
 #: Natural frequency of the loop around the reference [rad/s], and its damping ratio.
 _OMEGA, _DAMPING_RATIO = 25.0, 0.7
-#: Acceleration of the reference [speed per second], and time of the fastest sweep [s].
+#: Time in which the reference gets from rest to its speed, and time of the fastest sweep [s].
 _REVERSAL_S, _FASTEST_SWEEP_S = 0.15, 0.25
 #: Speeds of the sweeps as parts of the largest one, and seconds for each.
 _SWEEPS = ((1.0, 10.0), (0.5, 9.0), (0.2, 8.0), (0.07, 6.0))

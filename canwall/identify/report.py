@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 _DEVIATES = 0.1
 #: Length of the moving average with which 0x6077 is compared [cycles].
 _SLOW_CYCLES = 200
-#: Part of the cycle above which delay and lag of the drive cost stiffness and are called slow.
+#: Part of the cycle above which the lag of the drive costs stiffness and is called slow.
 _SLOW = 0.15
 
 

@@ -77,14 +77,22 @@ def test_handle_that_something_else_drives_tells_nothing() -> None:
 def test_break_away_of_a_ramp() -> None:
     """A handle at 0.3 rad that breaks loose at 12 mN·m under 0.2 N·m/s, without other friction."""
     rate, inertia = 0.2, 1e-4
-    time = np.arange(200) * PERIOD
-    torque = rate * time
+    time = np.arange(-150, 200) * PERIOD
+    torque = rate * np.maximum(time, 0.0)
     free = np.maximum(time - 0.06 - PERIOD, 0.0)
     position = 0.3 + np.round(rate * free**3 / (6.0 * inertia) / COUNT) * COUNT
     place, loose, uncertain = break_away(position, torque, PERIOD, COUNT, inertia, 1.0)
     assert place == pytest.approx([0.3])
     assert loose == pytest.approx([0.012], abs=float(uncertain[0]))
     assert uncertain[0] < 0.001
+
+
+def test_torque_that_passes_through_zero_is_no_ramp() -> None:
+    time = np.arange(2000) * PERIOD
+    torque = np.round(0.05 * np.sin(2.0 * np.pi * time), 3)
+    place, _, _ = break_away(np.cumsum(torque) * 1e-2, torque, PERIOD, COUNT, 1e-4, 1.0)
+    assert np.count_nonzero((torque[1:] != 0.0) & (torque[:-1] == 0.0)) >= 3
+    assert len(place) == 0
 
 
 def test_step_of_an_encoder_that_counts_in_fours() -> None:
