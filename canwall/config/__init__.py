@@ -41,6 +41,7 @@ from canwall.config.settings import (
     Stage,
     Wall,
     WallChange,
+    check_divider,
 )
 from canwall.config.simulation import Simulation
 from canwall.errors import ConfigError
@@ -76,6 +77,7 @@ __all__ = [
     "absolute_law",
     "catalogue",
     "changed",
+    "check_divider",
     "check_values",
     "first_error",
     "load",

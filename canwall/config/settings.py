@@ -215,6 +215,15 @@ class OperatorChange(Change):
     """Changes of `[operator]` while the wall is rendered."""
 
 
+def check_divider(wall: Wall, mechanics: Mechanics) -> None:
+    """Raise ValueError for a divider with which the bound of a cap is not that of the shaft."""
+    if wall.divider > 1 and wall.cap and mechanics.shaft_hz:
+        raise ValueError(
+            "wall.divider: has to be 1 with mechanics.shaft_hz and wall.cap, whose bound is "
+            "that of a law in every cycle; leave out wall.cap"
+        )
+
+
 @changing(Wall, (key for key in Wall.model_fields if key not in ("side", "alternate")))
 class _WallKeys(Change):
     """Changes of `[wall]`: all keys except the side and the alternating laws."""
@@ -321,6 +330,12 @@ class Settings(Section):
                 f"operator.heaviest_kg_m2 = {heaviest:g}: has to be more than the lightest "
                 f"inertia, {lightest:g}; raise it, or lower operator.lightest_kg_m2"
             )
+        rotor = self.mechanics.rotor_inertia_kg_m2
+        if self.operator.adapt and self.mechanics.shaft_hz and rotor and lightest <= rotor:
+            raise ValueError(
+                f"operator.lightest_kg_m2 = {lightest:g}: has to be more than the rotor's part, "
+                f"mechanics.rotor_inertia_kg_m2 = {rotor:g}"
+            )
         if [c.at_s for c in self.schedule] != sorted(c.at_s for c in self.schedule):
             raise ValueError("schedule: the entries have to be in the order of at_s")
         if self.wall.alternate and any(change.law for change in self.schedule):
@@ -330,12 +345,8 @@ class Settings(Section):
                 "schedule: operator.adapt: [mechanics] is with the hand where a run begins without "
                 "adapting; begin with operator.adapt = true"
             )
-        bounded_by_shaft = self.mechanics.shaft_hz and self.wall.cap
-        if bounded_by_shaft and any(stage.wall.divider > 1 for stage in self.stages):
-            raise ValueError(
-                "wall.divider: has to be 1 with mechanics.shaft_hz and wall.cap, whose bound is "
-                "that of a law in every cycle; leave out wall.cap"
-            )
+        for stage in self.stages:
+            check_divider(stage.wall, self.mechanics)
         low, high = self.limits.position_rad
         sections = ("wall", *(f"schedule.{i}" for i in range(len(self.schedule))))
         for section, stage in zip(sections, self.stages, strict=True):

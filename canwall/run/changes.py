@@ -28,6 +28,7 @@ from canwall.config import (
     WallChange,
     WatchBeat,
     changed,
+    check_divider,
     parse_request,
 )
 from canwall.cycle import (
@@ -245,6 +246,10 @@ def judged(axis: WallAxis, request: WallChange | TakeTurns) -> Offer:
                 f"limits.position_rad = [{low:g}, {high:g}]"
             )
         _check_law(axis, each)
+        try:
+            check_divider(each, axis.settings.mechanics)
+        except ValueError as error:
+            raise ConfigError(str(error)) from None
         set_wall(rehearsal, each, axis.laws)
     set_limits(rehearsal, offer.limits)
     return offer

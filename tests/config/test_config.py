@@ -173,6 +173,24 @@ REFUSED: list[tuple[dict[str, object], str]] = [
         },
         "wall.divider: has to be 1 with mechanics.shaft_hz and wall.cap",
     ),
+    (
+        {
+            "mechanics.shaft_hz": 300,
+            "mechanics.rotor_inertia_kg_m2": 1e-5,
+            "wall.divider": 2,
+            "schedule": [{"at_s": 1, "cap": 0.8}],
+        },
+        "wall.divider: has to be 1 with mechanics.shaft_hz and wall.cap",
+    ),
+    (
+        {
+            "mechanics.shaft_hz": 300,
+            "mechanics.rotor_inertia_kg_m2": 1e-5,
+            "operator.adapt": True,
+            "operator.lightest_kg_m2": 1e-5,
+        },
+        "operator.lightest_kg_m2 = 1e-05: has to be more than the rotor's part",
+    ),
     ({"bus.sync": "none"}, "bus.sync: has to be 'produce' or 'external', not 'none'"),
     ({"limits.energy_j": 0}, "limits.energy_j: has to be greater than 0, not 0"),
     (

@@ -284,6 +284,21 @@ def test_change_that_the_wall_in_force_does_not_allow_is_refused(
     assert bench.answers[3:] == [600]
 
 
+def test_divider_is_judged_as_that_of_a_configuration(make_rig: RigFactory, tmp_path: Path) -> None:
+    """The bound of a cap on an elastic shaft is that of a law in every cycle."""
+    shaft = {"mechanics.shaft_hz": 300.0, "mechanics.rotor_inertia_kg_m2": 1e-5}
+    bench = Bench(make_rig, tmp_path, shaft)
+    requests = {
+        300: lambda: bench.ask("divider=2"),
+        400: lambda: bench.ask("cap=0.8"),
+        500: lambda: bench.ask("divider=1", "cap=0.8"),
+    }
+    assert bench.run(requests).trips == []
+    assert bench.answers[0] == 300
+    assert "wall.divider: has to be 1 with mechanics.shaft_hz and" in str(bench.answers[1])
+    assert bench.answers[2] == 500
+
+
 def test_nothing_is_read_or_judged_in_the_loop(
     make_rig: RigFactory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
