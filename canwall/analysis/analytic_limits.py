@@ -11,6 +11,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from canwall.physics import zoh
+
 Array = NDArray[np.float64]
 
 #: Largest K·T²/m of any spring-damper wall at b = 0, and its B·T/m, for D = 0, 1, 2.
@@ -36,7 +38,7 @@ def passive_stiffness(viscous: float, damping: float, period: float, delay: int)
     if delay != 1:
         raise ValueError(f"no passivity limit for a delay of {delay} periods; it has to be 0 or 1")
     if viscous >= 5.0 * damping:
-        return (viscous + damping) / (1.5 * period)
+        return max(0.0, (viscous + damping) / (1.5 * period))
     if viscous <= damping:
         return 0.0
     # K·T/2 + B + (K·T)²/(8·B) = b.
@@ -70,25 +72,17 @@ def spectral_radius(
     f[j] = −K·y[j−D] − B·(y[j−D] − y[j−D−1])/T is held over the period that begins at j; the delay
     D is a whole number of periods.
     """
-    ratio = viscous / mass
-    decay = math.exp(-ratio * period)
-    if ratio * period > 1e-9:
-        travel = -math.expm1(-ratio * period) / ratio
-        gamma_y = (period - travel) / viscous
-    else:
-        travel, gamma_y = period, period * period / (2.0 * mass)
-    gamma_v = travel / mass
+    phi, gamma = zoh(mass, viscous, 0.0, period)
     # State: y, v, and y at the D + 1 samples before.
     n = 3 + delay
     loop = np.zeros((n, n))
-    loop[0, :2], loop[1, 1] = (1.0, travel), decay
+    loop[:2, :2] = phi
     samples = [0, *range(2, n)]
     for sample, gain in (
         (samples[delay], -stiffness - damping / period),
         (samples[delay + 1], damping / period),
     ):
-        loop[0, sample] += gamma_y * gain
-        loop[1, sample] += gamma_v * gain
+        loop[:2, sample] += gamma * gain
     for older, newer in zip(samples[1:], samples[:-1], strict=True):
         loop[older, newer] = 1.0
     return float(np.abs(np.linalg.eigvals(loop)).max())

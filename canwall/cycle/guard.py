@@ -183,7 +183,7 @@ def watch(
         position: Position at its SYNC, oriented towards the wall [rad].
         surface: That of the wall [rad].
         force: Force from the SYNC before up to this one, out of the wall [N·m].
-        rendering: False before and after the wall: nothing is observed.
+        rendering: False before and after the wall, and without a sample: nothing is observed.
     """
     if not rendering:
         return

@@ -435,6 +435,8 @@ def set_wall(cycle: NDArray[np.void], wall: Wall, laws: Sequence[Law]) -> None:
     cycle["is_blind"] = False
     rendered = cycle["rendered"][0]
     known = rendered["wall"][0]
+    # That the wall moves is no work of the operator's.
+    known["y_before"] += cycle["orientation"][0] * (rendered["position"] - wall.position_rad)
     rendered["position"] = wall.position_rad
     rendered["sampled"] = law.sampled
     rendered["estimated_velocity"] = wall.velocity == "estimated"

@@ -25,6 +25,7 @@ from canwall.walls import (
     doubt,
     end_lag,
     expect_torques,
+    follow_estimator,
     is_probe_in_flight,
     likelier,
     may_lag,
@@ -188,6 +189,9 @@ def _blind_force(cycle: Record, held: float) -> float:
         return held
     if not cycle.is_blind:
         cycle.blind[0] = cycle.rendered[0]
+        # Counted with the wall in this cycle already.
+        cycle.blind[0].elapsed -= cycle.period
+        cycle.blind[0].waited -= 1
         cycle.is_blind = True
     blind = cycle.blind[0]
     due = _advance_divider(blind, True)
@@ -318,6 +322,12 @@ def _may_begin_to_lag(cycle: Record) -> bool:
 
 
 @compiled
+def _sync_of_sample(cycle: Record) -> int:
+    """Return the number of the SYNC at which this cycle's sample was taken, as the drive counts."""
+    return cycle.j + cycle.skipped_sync - cycle.lag
+
+
+@compiled
 def _compare_lag(cycle: Record) -> None:
     """Compare the sample with both predictions, and go on with the likelier one in the end."""
     lagging, losing = cycle.lagging[0], cycle.losing[0]
@@ -326,6 +336,7 @@ def _compare_lag(cycle: Record) -> None:
         cycle.lag_evidence += likelier(lagging, losing, cycle.oriented)
     if cycle.lag_evidence > _LAG_EVIDENCE:
         cycle.estimator[0] = lagging
+        follow_estimator(cycle.bank[0], lagging)
         cycle.lag += 1
     if abs(cycle.lag_evidence) > _LAG_EVIDENCE:
         cycle.compares_lag = False
@@ -374,6 +385,8 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
         cycle.is_blind = False
     else:
         cycle.torque_actual = cycle.torque_per_mille
+        cycle.faded[0].elapsed += cycle.period
+        cycle.faded[0].waited += 1
         cycle.missed_in_a_row += 1
         cycle.missed_tpdo += 1
         cycle.missed_recently |= 1
@@ -392,7 +405,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
         if cycle.compares_lag:
             _compare_lag(cycle)
         spread = spread_in_force(cycle.bank[0])
-        sample = at_sync(cycle.latch[0], estimator, spread, cycle.j, cycle.oriented)
+        sample = at_sync(cycle.latch[0], estimator, spread, _sync_of_sample(cycle), cycle.oriented)
         correct(estimator, sample)
         if cycle.bank[0].count > 0:
             _identify_operator(cycle, sample)
@@ -416,7 +429,8 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     excess = cycle.bank[0].regression[0].excess
     expect_torques(cycle.latch[0], estimator, estimator.told + excess, sent)
     if cycle.bank[0].count > 0:
-        predict_bank(cycle.bank[0], estimator, sent, age_at(cycle.latch[0], cycle.j))
+        age = age_at(cycle.latch[0], _sync_of_sample(cycle))
+        predict_bank(cycle.bank[0], estimator, sent, age)
     predict(estimator, sent)
     if begins_lag:
         start_lagging(cycle.lagging[0], sent)

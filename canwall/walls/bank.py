@@ -196,7 +196,7 @@ def set_bank(
         count: One count of the encoder [rad].
         force_walk: See `kalman_model`; that of the lightest, and on an elastic shaft of all.
             The others are as quick as the lightest, or slower, as the encoder is felt.
-        delay: D in periods; its fraction counts.
+        delay: D in periods.
         shaft: What joins rotor and handle. Default: they are one.
         margin: Part of the delay that the filters alone have, not the regression. In periods.
         radius: Radius of the handle, at which the steps of the encoder are felt [m].
@@ -256,12 +256,11 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
     state, gain = bank.state, bank.gain
     bank.regression[0].delay = estimator.told
     if not estimator.settled:
-        for i in range(n):
-            state[0, i], state[1, i], state[2, i] = estimator.y, estimator.v, estimator.d
-            bank.trend[i] = 0.0
+        follow_estimator(bank, estimator)
         bank.equal = bank.alone = bank.pressed = 0
         bank.flies = bank.presses = False
-        begin_regression(bank.regression[0], y_sample, estimator.in_flight[estimator.delay_periods])
+        torque = estimator.in_flight[estimator.delay_periods]
+        begin_regression(bank.regression[0], y_sample, estimator.v, torque)
         bank.probe[0].samples = 0
         return False
     _note_flight(bank, estimator)
@@ -288,6 +287,14 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
     if changed:
         take_over(bank, estimator)
     return changed
+
+
+@compiled
+def follow_estimator(bank: Record, estimator: Record) -> None:
+    """Put all filters at the state of the estimator."""
+    for i in range(bank.count):
+        bank.state[0, i], bank.state[1, i] = estimator.y, estimator.v
+        bank.state[2, i], bank.trend[i] = estimator.d, 0.0
 
 
 @compiled

@@ -71,7 +71,7 @@ def hand_damping(inertia: float, most: float) -> float:
 
     Fingers of a few grams have some newton seconds per metre, a grip and an arm hardly more.
     """
-    return most * inertia / (inertia + most * _HAND_S)
+    return most * inertia / (inertia + most * _HAND_S) if most > 0.0 else 0.0
 
 
 def stiffest_walls(

@@ -6,8 +6,9 @@ it there exactly. n is predicted, not read off the sign of y (5.16 is acausal), 
 underneath may bring the handle out a sample early.
 
 It is kept as long as the handle is where the forces should have brought it. Where it is not (the
-model is wrong, a force was clamped, the operator moves), a new plan is made from where it is: the
-last two forces of a stale plan grow with m/T² times its error.
+model is wrong, a force was clamped, the operator moves), a new plan is made from where it is, since
+the last two forces of a stale plan grow with m/T² times its error. Only the last force goes out as
+planned: it is too late for another two.
 """
 
 import math

@@ -18,6 +18,8 @@ from canwall.physics import zoh, zoh_coefficients
 
 #: Largest delay, in whole periods, between a sample and the force computed from it.
 MAX_DELAY = 3
+#: Number of forces that are kept: those in flight, and before the one that acts the two last steps.
+FORCES_KEPT = MAX_DELAY + 3
 
 #: Periods without a sample after which the prediction says nothing about a hand's motion: the
 #: estimate starts again, and its uncertainty grows no further.
@@ -61,8 +63,9 @@ ESTIMATOR = np.dtype(
         ("open_loop_y", "f8"),
         ("open_loop_v", "f8"),
         ("open_loop_d", "f8"),
-        # Forces of the last samples, newest first: in_flight[0] was computed one sample ago.
-        ("in_flight", "f8", (MAX_DELAY + 1,)),
+        # Forces of the last samples, newest first: in_flight[0] was computed one sample ago. The
+        # oldest ones have acted.
+        ("in_flight", "f8", (FORCES_KEPT,)),
     ],
     align=True,
 )
@@ -373,7 +376,7 @@ def unit_motion(
 
 @compiled
 def _put_in_flight(estimator: Record, force: float) -> None:
-    for age in range(MAX_DELAY, 0, -1):
+    for age in range(FORCES_KEPT - 1, 0, -1):
         estimator.in_flight[age] = estimator.in_flight[age - 1]
     estimator.in_flight[0] = force
 
@@ -384,7 +387,7 @@ def stand_still(estimator: Record, periods: int) -> None:
 
     A torque that waits for a SYNC waits on; one that has taken effect stays.
     """
-    force = estimator.in_flight[estimator.delay_periods]
+    force = estimator.in_flight[int(estimator.told)]
     for _ in range(min(periods, _LONGEST_GAP + 1)):
         note_missing_sample(estimator)
         if estimator.gap < _LONGEST_GAP:
@@ -398,6 +401,8 @@ def stand_still(estimator: Record, periods: int) -> None:
 @compiled
 def may_lag(estimator: Record) -> bool:
     """Return True if the forces in flight suffice for samples that are a period older."""
+    if estimator.told + 1.0 > MAX_DELAY:
+        return False
     whole = estimator.delay_periods + 1
     return whole < MAX_DELAY or (whole == MAX_DELAY and estimator.before[0].duration == 0.0)
 
@@ -424,7 +429,7 @@ def end_lag(estimator: Record) -> None:
         _predict_covariance(estimator)
     n = estimator.delay_periods
     y, v, d = estimator.y, estimator.v, estimator.d
-    before = estimator.in_flight[n + 1] if n < MAX_DELAY else 0.0
+    before = estimator.in_flight[n + 1]
     y, v = _hold(estimator, estimator.before[0], y, v, before + d)
     estimator.y, estimator.v = _hold(
         estimator, estimator.after[0], y, v, estimator.in_flight[n] + d

@@ -241,6 +241,8 @@ def clear_memory(wall: NDArray[np.void]) -> None:
 #: Growth in a period of a stiffness that the mass in force allows again: inside the wall, where
 #: the spring is loaded, and outside.
 _GROWTH_INSIDE, _GROWTH_OUTSIDE = 1.03, 1.2
+#: Share of the stiffness asked for from which it grows, where no wall was allowed before.
+_LEAST_SHARE = 1e-3
 
 
 @compiled
@@ -250,7 +252,8 @@ def put_in_force(wall: Record) -> None:
     if wall.cap > 0.0:
         growth = _GROWTH_INSIDE if wall.y_sample < 0.0 else _GROWTH_OUTSIDE
         allowed = capped_stiffness(stiffness, wall.cap, wall.mass, wall.period)
-        stiffness = min(allowed, wall.stiffest, growth * wall.stiffness)
+        before = max(wall.stiffness, _LEAST_SHARE * stiffness)
+        stiffness = min(allowed, wall.stiffest, growth * before)
     wall.stiffness = stiffness
     ratio = wall.damping_ratio * (1.0 + wall.doubt)
     wall.damping = damping_of_ratio(wall.asked_damping, ratio, stiffness, wall.mass)

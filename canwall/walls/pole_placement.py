@@ -40,11 +40,12 @@ def placing_gains(wall: Record) -> tuple[float, float]:
 @compiled
 def placed_force(wall: Record) -> float:
     """Return the state feedback about the equilibrium under the bias force, while inside."""
-    if wall.y >= 0.0 or wall.stiffness == 0.0:
+    if wall.y >= 0.0:
         return 0.0
     k1, k2 = placing_gains(wall)
     # The equilibrium under a bias force has to be that of the wall, which holds −K·y_eq there.
-    y_eq = wall.d / (wall.spring + wall.stiffness)
+    stiffness = wall.spring + wall.stiffness
+    y_eq = wall.d / stiffness if stiffness > 0.0 else 0.0
     return -k1 * wall.y - k2 * wall.v - (wall.stiffness - k1) * y_eq
 
 

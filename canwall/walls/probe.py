@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
-from canwall.walls.estimator import MAX_DELAY
+from canwall.walls.estimator import FORCES_KEPT, MAX_DELAY
 
 #: A probe.
 PROBE = np.dtype(
@@ -21,7 +21,7 @@ PROBE = np.dtype(
         ("stronger", "f8"),  # torque of the present probe, as a multiple of that
         ("samples", "i8"),  # of the present probe up to now
         ("acts", "?"),  # the force of this cycle is a probe's
-        ("in_flight", "f8", (MAX_DELAY + 1,)),  # torques of probes, newest first
+        ("in_flight", "f8", (FORCES_KEPT,)),  # torques of probes, newest first
     ],
     align=True,
 )
@@ -90,8 +90,8 @@ def probe_torque(
 def is_probe_in_flight(probe: Record) -> bool:
     """Return True if one of the torques in flight is a probe's."""
     found = False
-    for torque in probe.in_flight:
-        found |= torque != 0.0
+    for age in range(MAX_DELAY + 1):
+        found |= probe.in_flight[age] != 0.0
     return found
 
 
@@ -107,7 +107,7 @@ def other_torque_acts(probe: Record, in_flight: NDArray[np.float64], delay_perio
 @compiled
 def send_probe(probe: Record, force: float) -> None:
     """Note the part of a probe in the force that is sent, as it is rounded."""
-    for age in range(MAX_DELAY, 0, -1):
+    for age in range(FORCES_KEPT - 1, 0, -1):
         probe.in_flight[age] = probe.in_flight[age - 1]
     probe.in_flight[0] = force if probe.acts else 0.0
     probe.acts = False

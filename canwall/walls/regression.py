@@ -136,7 +136,7 @@ def set_regression(
         lightest: Smallest mass that there may be.
         period: T [s].
         count: One count of the encoder [rad].
-        delay: D in periods; its fraction counts.
+        delay: D in periods.
         shaft: What joins rotor and handle. Default: they are one.
     """
     regression["period"], regression["resolution"] = period, abs(count)
@@ -195,17 +195,21 @@ def comes(regression: Record) -> bool:
 
 
 @compiled
-def begin_regression(regression: Record, y: float, torque: float) -> None:
-    """Begin at rest at y, where something holds against a torque; what is known stays.
+def begin_regression(regression: Record, y: float, v: float, torque: float) -> None:
+    """Begin at y and a steady v, while something holds against a torque; what is known stays.
 
     A torque that seemed to begin now and to move nothing would be on something heavy.
     """
     t = regression.period
     regression.observed[:] = 0.0
-    regression.observed[2, 1] = -torque
+    regression.observed[1, 0], regression.observed[2, 1] = v, -torque
+    regression.observed[2, 2] = -v
+    if v != 0.0:
+        regression.observed[2, 3] = -math.copysign(1.0, v)
     regression.shaft_torque, regression.begun = torque, 0.5 * t * t * torque
     regression.observed[0, 0] = regression.load = y - regression.softness * t * t * torque
-    regression.samples[:] = y
+    for age in range(_RECENT):
+        regression.samples[age] = y - age * t * v
     regression.way = 0.0
     regression.steady = 0
     end_swing(regression.swing[0])
@@ -340,7 +344,7 @@ def _torque_steps(estimator: Record) -> float:
     """Return the sum of the last two steps of the torque that acted, without sign [N·m]."""
     steps = 0.0
     n = estimator.delay_periods
-    for age in range(n, min(n + 2, MAX_DELAY)):
+    for age in range(n, n + 2):
         steps += abs(estimator.in_flight[age] - estimator.in_flight[age + 1])
     return steps
 

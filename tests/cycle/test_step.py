@@ -1,5 +1,6 @@
 """One cycle without a bus: frames' data in and out, holding, trips, walls on either side."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +11,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rig import settings_with
 
+from canwall.compiled import copied
 from canwall.config import Settings
 from canwall.cycle import Trip, fade_in, make_cycle, run_laws, set_wall, step
-from canwall.cycle.state import RECENT_CYCLES, start_at
+from canwall.cycle.state import RECENT_CYCLES, fade_over, start_at
 from canwall.drive import DriveSetup, Field, PdoLayout
 from canwall.record import ROW, Phase
 from canwall.units import DriveUnits
-from canwall.walls import UnknownLawError
+from canwall.walls import UnknownLawError, age_at
 
 ENABLED = 0x0237
 POSITION, STATUSWORD, TORQUE = 0x6064, 0x6041, 0x6077
@@ -237,9 +239,88 @@ def test_rate_of_the_torque_is_limited_without_tpdos() -> None:
     assert [wall.missing() for _ in range(3)] == [0, 60, 120]
 
 
+#: A damper of 0.1 N·m·s/rad, which goes by the speed between its samples.
+DAMPER = {"wall.law": "damped", "wall.damping_nm_s_per_rad": 0.1, "limits.hold_cycles": 20}
+DAMPER["wall.stiffness_nm_per_rad"] = 0.0
+
+
+@pytest.mark.parametrize("divider", [1, 3])
+def test_law_without_a_sample_sees_the_speed_of_the_motion(divider: int) -> None:
+    wall = gliding(-2, -10, DAMPER | {"wall.divider": divider})
+    moves = [wall.at(-10 - 2 * j) for j in range(4 * divider)]
+    assert moves[-1] == 200
+    assert [wall.missing() for _ in range(7)] == [200] * 7
+
+
+def test_wall_that_fades_out_sees_the_speed_of_the_motion() -> None:
+    wall = gliding(-2, -10, DAMPER)
+    wall.at(-10), wall.at(-12)
+    fade_over(wall.cycle, 50)
+    set_wall(wall.cycle, wall.settings.wall, wall.laws)  # into itself
+    assert [wall.at(-14), wall.at(-16)] == [200, 200]
+    for _ in range(5):
+        wall.missing()
+    assert [wall.at(-28 - 2 * j) for j in range(3)] == [200] * 3
+
+
+def test_wall_that_moves_does_no_work() -> None:
+    """The tension of a budget is what the operator has put in; here nobody moves."""
+    wall = Wall({"wall.tension": "budget", "mechanics.inertia_kg_m2": 1e4})
+    start_at(wall.cycle, 0)
+    for j in range(220):
+        wall.at(-min(j, 20))
+    put_in = wall.cycle["rendered"]["wall"]["absorbed"].item()
+    assert put_in > 5e-3  # ½·K·y² = 10 mJ
+    for position in (0.01, -0.01):
+        moved = copied(wall.cycle)
+        set_wall(moved, wall.settings.wall.model_copy(update={"position_rad": position}), wall.laws)
+        step(moved, wall.row, -20 & 0xFFFFFFFF | ENABLED << 32, True)
+        assert moved["rendered"]["wall"]["absorbed"].item() == pytest.approx(put_in, rel=0.01)
+
+
+def test_bank_goes_on_with_the_estimator_that_lags() -> None:
+    """TPDOs that are a cycle late from one to the next, of a handle at 4 rad/s."""
+    units = DriveUnits(131072.0, 0.637)
+    far = {"limits.position_rad": [-3.0, 3.0], "wall.position_rad": -2.5, "operator.adapt": True}
+    wall = Wall({"wall.law": "mean_force", "limits.stuck_rad": 0.0} | far, units=units)
+    at = [round((1.0 - 4e-3 * j) / units.rad_per_count) for j in range(300)]
+    start_at(wall.cycle, at[0])
+    for j in range(200):
+        wall.at(at[j])
+    wall.missing()
+    for j in range(200, 230):
+        wall.at(at[j])
+        estimator = wall.cycle["estimator"]
+        if wall.cycle["lag"][0]:
+            assert estimator["v"].item() == pytest.approx(-4.0, abs=0.02)
+            expected = (1.0 - 4e-3 * (j + 1)) / units.rad_per_count
+            assert estimator["y"].item() / units.rad_per_count == pytest.approx(expected, abs=1.0)
+    assert wall.cycle["lag"][0] == 1
+
+
+@pytest.mark.parametrize("drive_cycle", [0.00045, 0.0006])
+def test_ages_of_positions_go_on_over_skipped_syncs(drive_cycle: float) -> None:
+    units = DriveUnits(131072.0, 0.637)
+    servo = {"drive.drive_cycle_s": drive_cycle, "drive.current_bandwidth_hz": 1600.0}
+    far = {"limits.position_rad": [-3.0, 3.0], "wall.position_rad": -2.5, "limits.stuck_rad": 0.0}
+    wall = Wall({"wall.law": "mean_force", "simulation.ideal": False} | servo | far, units=units)
+    start_at(wall.cycle, round(1.0 / units.rad_per_count))
+    errors = []
+    for j in range(230):
+        if j == 200:
+            wall.cycle["skipped"] = 1
+        number = j + (j >= 200)
+        latched = (math.floor(number * 1e-3 / drive_cycle + 0.3) - 0.3) * drive_cycle
+        wall.at(round((1.0 - latched) / units.rad_per_count))
+        found = age_at(wall.cycle["latch"][0, 0], number)
+        errors.append(found - (number - 1e3 * latched))
+    assert np.std(errors[150:200]) < 0.01
+    assert np.std(errors[200:215]) < 0.01
+
+
 def test_memories_of_a_law_are_those_of_its_samples() -> None:
-    seen, blind = (gliding(3, -14, {"wall.law": "two_step"}) for _ in range(2))
-    seen.at(-14), blind.at(-14)
+    blind = gliding(3, -14, {"wall.law": "two_step"})
+    blind.at(-14)
     wall_before = blind.cycle["rendered"]["wall"]["memory"].copy()
     blind.missing()
     assert (blind.cycle["rendered"]["wall"]["memory"] == wall_before).all()

@@ -122,6 +122,7 @@ def test_passive_stiffness_solves_its_inequality(damping: float, delay: int) -> 
     else:
         assert 1.5 * kt - damping == pytest.approx(viscous)
     assert passive_stiffness(viscous, 1.1, period, delay) == 0.0
+    assert passive_stiffness(viscous, -1.1, period, delay) == 0.0
 
 
 def lasts(dataset: xr.Dataset) -> bool:

@@ -15,6 +15,7 @@ from canwall.cycle.state import modelled_delay
 from canwall.walls import (
     BANK,
     ESTIMATOR,
+    MAX_DELAY,
     ElasticShaft,
     correct,
     correct_bank,
@@ -22,6 +23,7 @@ from canwall.walls import (
     end_lag,
     force_walk_of,
     hand_damping,
+    may_lag,
     note_missing_sample,
     predict,
     predict_bank,
@@ -31,11 +33,13 @@ from canwall.walls import (
     set_estimator,
     set_model,
     set_pace,
+    stand_still,
     start_lagging,
     stiffest_walls,
     take_over,
 )
-from canwall.walls.estimator import gain_with_trend
+from canwall.walls.estimator import gain_with_trend, set_model_delay
+from canwall.walls.regression import _torque_steps
 
 PERIOD, COUNT, WALK, DELAY = 1e-3, 4.8e-5, 0.02, 1.35
 MASSES = np.geomspace(1e-4, 4.5e-3, 16)
@@ -487,9 +491,57 @@ def test_hand_is_forgotten_after_the_contact() -> None:
 
 
 def test_lost_samples_do_not_change_the_mass() -> None:
-    found = play(*bank_at(0.0), 1.4e-3, pulses(0.3), lost=(75, 76, 77))
+    torques = np.concatenate([pulses(0.3), pulses(0.3)])
+    found = play(*bank_at(0.0), 1.4e-3, torques, lost=(75, 76, 77))
     assert np.all(found[75:78] == found[74])
     np.testing.assert_allclose(found[88:], 1.4e-3, rtol=0.15)
+    assert found[-1] != found[88]  # learned from the second pulses, too
+
+
+def test_found_delay_is_none_of_the_bus() -> None:
+    """What waits for a SYNC, and how many more periods may be missed, go by the delay as told."""
+    for told, excess, lags in ((1.0, -0.2, True), (2.25, -0.4, False)):
+        bank, estimator = np.zeros(1, BANK), np.zeros(1, ESTIMATOR)
+        of_bank, of_filter = (0.0, PERIOD, COUNT, WALK), (0.0, 0.0, PERIOD, COUNT, WALK)
+        set_bank(bank, MASSES, VISCOUS, *of_bank, told + 0.1, margin=0.1)
+        set_estimator(estimator, MASSES[0], VISCOUS[0], *of_filter, told + 0.1, 0.1)
+        reset_estimator(estimator, 0.0)
+        reset_bank(bank, 0.0)
+        set_pace(bank[0], 1e9)
+        bank["regression"]["excess"] = excess
+        correct(estimator[0], 0.0)
+        correct_bank(bank[0], estimator[0], 0.0)
+        assert estimator["delay_periods"] == int(told) - (told + 0.1 + excess < int(told))
+        assert may_lag(estimator[0]) == lags
+        estimator["in_flight"][0, 0] = 0.5
+        stand_still(estimator[0], 5)
+        assert estimator["v"] == 0.0
+
+
+def test_hand_without_damping() -> None:
+    assert hand_damping(0.0, 0.0) == hand_damping(1e-3, 0.0) == 0.0
+
+
+def test_lost_samples_in_motion_leave_what_is_known_of_the_mass() -> None:
+    """The observer begins anew at the handle's speed: at rest it would not explain the motion."""
+    known = []
+    for lost in ((), (100,)):
+        bank, estimator = bank_at(0.0)
+        play(bank, estimator, 1.4e-3, np.concatenate([pulses(0.3), np.zeros(80)]), lost)
+        known.append(bank["regression"]["information"][0, 0, 1, 1])
+        np.testing.assert_allclose(estimator["mass"], 1.4e-3, rtol=0.15)
+    assert estimator["settled"]
+    assert known[1] > 0.5 * known[0]
+
+
+@pytest.mark.parametrize("delay", [0.35, 1.35, 2.35, float(MAX_DELAY)])
+def test_both_last_steps_of_the_torque_are_uncertain(delay: float) -> None:
+    _, estimator = bank_at(0.0)
+    set_model_delay(estimator[0], delay)
+    for step in (1.0, -2.0, 4.0, -8.0, 16.0, -32.0):
+        predict(estimator[0], step)
+    acting = [-32.0, 16.0, -8.0, 4.0, -2.0, 1.0][int(delay) :][:3]
+    assert _torque_steps(estimator[0]) == np.abs(np.diff(acting)).sum()
 
 
 def test_drive_cycle_and_lag_belong_to_the_delay() -> None:

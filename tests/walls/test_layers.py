@@ -7,7 +7,7 @@ import pytest
 from bouncing import Array, bounces
 from law_bench import PREDICTING, bounced_in_python, force_at, wall_of
 
-from canwall.walls import LAWS, set_applied_force
+from canwall.walls import LAWS, put_in_force, set_applied_force
 from canwall.workbench import Ball, sampled_ball
 
 #: Each pulls now and then on this ball.
@@ -97,6 +97,23 @@ def test_budget_lets_a_pull_that_takes_energy_pass() -> None:
     wall = wall_of(Ball(tension="budget", gravity=0.0, stiffness=4.0), "midpoint")
     assert force_at(wall, "midpoint", -0.01, 1.0) == pytest.approx(-4.0 * 0.04)
     assert wall["absorbed"][0] == 0.0
+
+
+@pytest.mark.parametrize("y", [-0.01, 0.01])
+def test_stiffness_comes_back_from_nothing(y: float) -> None:
+    """A hand for which the shaft allows no wall is followed by one for which it does."""
+    wall = wall_of(Ball(stiffness=100.0), "half_sample")
+    wall["cap"], wall["y_sample"], wall["stiffest"] = 100.0, y, 0.0
+    put_in_force(wall[0])
+    assert wall["stiffness"] == 0.0
+    wall["stiffest"] = 4.57
+    least = 4.57
+    for _ in range(200):
+        before = wall["stiffness"].item()
+        put_in_force(wall[0])
+        least = min(least, wall["stiffness"].item() - before)
+    assert wall["stiffness"] == 4.57
+    assert least >= 0.0
 
 
 def test_absorbed_energy_ends_with_the_contact() -> None:

@@ -96,6 +96,15 @@ def test_pole_placement_keeps_the_equilibrium_under_a_bias(ball: Ball, press: fl
     assert v * ball.period == pytest.approx(0.0, abs=1e-12)
 
 
+def test_pole_placement_of_a_damper_alone() -> None:
+    """Without a spring the velocity decays as that of the continuous damper, e^(−(b + B)·T/m)."""
+    ball = Ball(stiffness=0.0, damping=0.02, mass=1e-4, viscous=1e-3, gravity=0.0, period=1e-3)
+    force = force_at(wall_of(ball, "pole_placement"), "pole_placement", -0.01, -1.0)
+    phi, gamma = zoh_of(ball.mass, ball.viscous, ball.spring, ball.period)
+    _, v = phi @ [-0.01, -1.0] + gamma * force
+    assert v == pytest.approx(-math.exp(-0.021 * 1e-3 / 1e-4), rel=1e-9)
+
+
 @pytest.mark.parametrize("theta", [0.01, 0.1, 1.0, 2.0, 3.0])
 def test_pole_placement_of_a_mass_in_closed_form(theta: float) -> None:
     mass, period = 0.3, 0.02

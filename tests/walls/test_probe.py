@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from canwall.walls import WALL
+from canwall.walls import MAX_DELAY, WALL
 from canwall.walls.probe import (
     PROBE,
     is_probe_in_flight,
@@ -104,5 +104,5 @@ def test_torques_of_probes_are_told_from_the_wall_s() -> None:
         np.testing.assert_array_equal(probe["in_flight"][0], expected)
         assert is_probe_in_flight(probe[0]) == np.any(expected)
         for delay in (0, 1, 2):
-            acts = np.any(in_flight[delay:] >= 0.1)
+            acts = np.any(in_flight[delay : MAX_DELAY + 1] >= 0.1)
             assert other_torque_acts(probe[0], in_flight, delay) == acts

@@ -249,7 +249,7 @@ def test_torque_that_something_holds_tells_nothing() -> None:
     for held in (torque, 0.0):
         regression = made()
         estimator["in_flight"] = torque
-        begin_regression(regression[0], 0.0, held)
+        begin_regression(regression[0], 0.0, 0.0, held)
         for _ in range(60):
             learn(regression[0], estimator[0], 0.0, LIGHTEST, False, False)
             send(regression, estimator, torque)
