@@ -39,6 +39,7 @@ NAMED = {
     "model_error": ("1", "relative error of the model's inertia"),
     "servo": ("", "file: as configured; ideal: as with simulation.ideal; 1600Hz, 800Hz: real ones"),
     "friction": ("N*m", "Coulomb friction; 1.5 times as much holds at rest"),
+    "breakaway": ("1", "what holds at rest, over Coulomb friction"),
     "delay_error": ("1", "error of the D that the laws reckon with, in cycles"),
     "speed": ("rad/s", "mean speed of the hand's approach"),
     "phase": ("1", "phase of the contact relative to the SYNC"),
@@ -283,6 +284,12 @@ def _with_friction(settings: Settings, coulomb: Value) -> Settings:
     return with_overrides(settings, {f"simulation.{key}": value for key, value in keys.items()})
 
 
+def _with_breakaway(settings: Settings, ratio: Value) -> Settings:
+    assert settings.simulation is not None  # nothing else is swept
+    stiction = float(ratio) * settings.simulation.coulomb_nm
+    return with_overrides(settings, {"simulation.stiction_nm": stiction})
+
+
 def _with_operator(settings: Settings, name: Value) -> Settings:
     return with_overrides(settings, OPERATORS[str(name)].keys)
 
@@ -297,4 +304,5 @@ _CHANGES: dict[str, Callable[[Settings, Value], Settings]] = {
     "operator": _with_operator,
     "servo": _with_servo,
     "friction": _with_friction,
+    "breakaway": _with_breakaway,
 }

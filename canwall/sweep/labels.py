@@ -18,6 +18,7 @@ LABELS = {
     "model_error": "relative error of the model's inertia",
     "counts": "encoder [counts per turn]",
     "torque_step": "torque step [N·m]",
+    "breakaway": "stiction over Coulomb friction",
     "sync_jitter": "standard deviation of the SYNC [s]",
     "press_torque": "torque with which the hand presses [N·m]",
 }

@@ -66,6 +66,11 @@ BENCHES: dict[str, dict[str, Sequence[float | str]]] = {
     "2 kHz": {"rate": (2000.0,)},
     "rotor a quarter as heavy": {"simulation.inertia_kg_m2": (2.5e-5,)},
     "rotor four times as heavy": {"simulation.inertia_kg_m2": (4e-4,)},
+    "inertia configured 20 % too small": {"model_error": (-0.2,)},
+    "inertia configured 20 % too large": {"model_error": (0.2,)},
+    "torque constant 10 % less": {"simulation.torque_constant_error": (-0.1,)},
+    "torque constant 10 % more": {"simulation.torque_constant_error": (0.1,)},
+    "stiction twice the Coulomb friction": {"breakaway": (2.0,)},
 }
 _BENCH_DRAWS = 24
 #: First strikes: the wall [N·m/rad], the speeds of approach [rad/s], and the phases.

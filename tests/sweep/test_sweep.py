@@ -24,6 +24,7 @@ from canwall import cli
 from canwall.analysis.k_limit import FINE_FACTOR
 from canwall.errors import InputError
 from canwall.sweep import Plan, ineffective_axis_notes, make_plan, read_sweep, sweep, sweep_table
+from canwall.sweep.axes import settings_at
 from canwall.sweep.journal import Journal
 from canwall.sweep.plan import compute_piece
 from canwall.sweep.workers import compute_pieces
@@ -175,6 +176,13 @@ def test_numbers_of_plant_and_strike_are_axes(axis: str, values: list[object]) -
     plan = plan_of(stiffness=[20.0], **{"simulation.ideal": [False], axis: values})
     one, other = (compute_piece(plan, piece)[0, 0] for piece in range(2))
     assert one["penetration"] != other["penetration"]
+
+
+def test_stiction_goes_with_the_friction_of_an_axis() -> None:
+    axes = {"servo": ["1600Hz"], "friction": [0.01, 0.02], "breakaway": [2.0]}
+    plan = plan_of(stiffness=[20.0], **axes)
+    found = [settings_at(plan.base, point).simulation for point in plan.points]
+    assert [(s.coulomb_nm, s.stiction_nm) for s in found if s] == [(0.01, 0.02), (0.02, 0.04)]
 
 
 class StoppedError(Exception):
