@@ -110,7 +110,7 @@ def set_guard(guard: NDArray[np.void], action: str, period: float, count: float)
     guard["action"] = GUARD_ACTIONS[action]
     guard["factor"] = guard["lowest"] = 1.0
     guard["first_alarm"] = -1
-    guard["count"] = abs(count)
+    guard["count"] = count
     guard["block"] = max(1, round(BLOCK_S / period))
     guard["hold"] = round(HOLD_S / period)
     guard["longest"] = round(BOUNCE_S / period)

@@ -96,6 +96,7 @@ CYCLE = np.dtype(
         ("out_torque", _FIELD, (1,)),
         # Scales and limits.
         ("period", "f8"),
+        # Scales of the drive, both above zero: on reversed drives a wall would pull.
         ("rad_per_count", "f8"),
         ("nm_per_mille", "f8"),
         ("drive_torque_limit", "f8"),
@@ -289,7 +290,7 @@ def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None
         masses, dampings = _hands(settings)
         mass, viscous, coulomb = masses[0], dampings[0], 0.0
         bandwidth = min(bandwidth, lightest_bandwidth(delay, period))
-        force_walk = force_walk_of(bandwidth, mass, period, abs(count))
+        force_walk = force_walk_of(bandwidth, mass, period, count)
         set_bank(
             cycle["bank"][0],
             masses,
@@ -408,8 +409,8 @@ def set_limits(cycle: NDArray[np.void], limits: Limits) -> None:
     cycle["energy_limit"] = limits.energy_j or math.inf
     period, count = cycle["period"].item(), cycle["rad_per_count"].item()
     jump = limits.jump_rad or limits.speed_rad_s * period
-    cycle["jump_limit"] = jump + _JUMP_COUNTS * abs(count)
-    stuck = max(limits.stuck_rad, _STUCK_COUNTS * abs(count))
+    cycle["jump_limit"] = jump + _JUMP_COUNTS * count
+    stuck = max(limits.stuck_rad, _STUCK_COUNTS * count)
     shaft = ElasticShaft(*cycle["shaft"][0].tolist())
     if shaft.rotor:
         # What stops a handle slowly stops a rotor in no time.
@@ -418,7 +419,7 @@ def set_limits(cycle: NDArray[np.void], limits: Limits) -> None:
     cycle["stuck_cycles"] = limits.stuck_cycles
     error = limits.torque_error_nm
     if error is None:
-        rated_part = _TORQUE_ERROR_PER_MILLE * abs(cycle["nm_per_mille"].item())
+        rated_part = _TORQUE_ERROR_PER_MILLE * cycle["nm_per_mille"].item()
         error = max(_TORQUE_ERROR_PART * limits.torque_nm, rated_part)
     cycle["torque_error_limit"] = error or math.inf
     cycle["torque_error_cycles"] = limits.torque_error_cycles

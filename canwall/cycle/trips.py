@@ -105,8 +105,8 @@ def _is_stuck(cycle: Record) -> bool:
     least = min(last - 1.0, 2.0 * last - before - 3.0)
     if least < _LEAST_COUNTS:
         return False
-    unmodelled = _UNMODELLED * abs(cycle.nm_per_mille) / cycle.estimator[0].mass
-    went = least * abs(cycle.rad_per_count) - unmodelled * cycle.period**2
+    unmodelled = _UNMODELLED * cycle.nm_per_mille / cycle.estimator[0].mass
+    went = least * cycle.rad_per_count - unmodelled * cycle.period**2
     return min(went * cycle.stuck_cycles, cycle.motion_missed) > cycle.stuck_limit
 
 
@@ -160,7 +160,7 @@ def compare_torque(cycle: Record) -> None:
     cycle.lowest_sent = min(sent, cycle.lowest_sent + fading * (sent - cycle.lowest_sent))
     actual = float(cycle.torque_actual)
     beyond = max(actual - cycle.highest_sent, cycle.lowest_sent - actual)
-    cycle.torque_error = beyond * abs(cycle.nm_per_mille)
+    cycle.torque_error = beyond * cycle.nm_per_mille
     limited = cycle.statusword & _INTERNAL_LIMIT
     if cycle.torque_error > cycle.torque_error_limit and not limited:
         cycle.unfollowed += 1

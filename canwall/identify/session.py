@@ -124,7 +124,7 @@ class Identification:
         if len(counts) < 2 or not np.any(np.diff(counts)):
             raise UntellingDataError("the position did not change by a single count")
         axis = self._axis
-        step = encoder_step(counts) * abs(float(axis.cycle["rad_per_count"][0]))
+        step = encoder_step(counts) * float(axis.cycle["rad_per_count"][0])
         return Measured(position, torque, actual, counts, axis.settings.bus.cycle_s, step)
 
 

@@ -90,7 +90,7 @@ def stiffest_walls(
         Stiffnesses [N·m/rad], shape (n,).
     """
     within_delay = _STIFFEST * (_LONG_DELAY / max(delay, SHORTEST_DELAY)) ** _SOFTENING
-    return np.minimum(within_delay * masses / period**2, _STEP_N * radius / abs(count))
+    return np.minimum(within_delay * masses / period**2, _STEP_N * radius / count)
 
 
 def lightest_bandwidth(delay: float, period: float) -> float:
@@ -124,7 +124,7 @@ def set_filters(
     for i in range(len(masses)):
         plant = float(masses[i]), bank["viscous"][i].item(), spring, period
         walk, heavier, slower, lively = force_walk, float(masses[i] / masses[0]), 1.0, 1.0
-        count_force = plant[0] * abs(count) / (period**2 * radius)
+        count_force = plant[0] * count / (period**2 * radius)
         felt_less = _COUNT_FORCE_N / count_force
         if rigid:
             damped = min(plant[1] / (plant[0] * _DAMPED), 1.0)
@@ -132,7 +132,7 @@ def set_filters(
             slower = min(calm, _STEADY / lightest * felt_less**_STEADINESS)
             lively = max(min(1.0, _LIVELY_N / count_force) ** _STEADINESS, slower)
             walk *= heavier * slower**3  # by the cube of the bandwidth
-            bank["within"][i] = 0.5 * _WITHIN * max(1.0 - felt_less, 0.0) * abs(count)
+            bank["within"][i] = 0.5 * _WITHIN * max(1.0 - felt_less, 0.0) * count
         _set_filter(bank, i, kalman_model(*plant, count, walk))
         _set_paces(bank, i, plant, count, walk, lively / slower, rigid)
         _set_torques(bank, i, *plant)

@@ -79,7 +79,7 @@ def set_latch(latch: np.void, period: float, drive_cycle: float, count: float) -
     turn = math.remainder(period / drive_cycle, 1.0) if drive_cycle else 0.0
     latch["turn"] = turn if abs(turn) >= _LEAST_TURN else 0.0
     latch["tick"] = drive_cycle / period
-    latch["period"], latch["resolution"] = period, abs(count)
+    latch["period"], latch["resolution"] = period, count
 
 
 def reset_latch(latch: np.void) -> None:

@@ -49,10 +49,10 @@ def set_probe(
         count: One count of the encoder [rad].
         slower: Multiple of the usual period and motion, for an observer that is as much slower.
     """
-    probe["resolution"], probe["lightest"] = abs(count), lightest
+    probe["resolution"], probe["lightest"] = count, lightest
     probe["half"] = half = slower * max(round(_HALF_S / period), _SAMPLES)
     quarter = 0.5 * half * period
-    probe["torque"] = slower * _COUNTS * abs(count) * lightest / quarter**2
+    probe["torque"] = slower * _COUNTS * count * lightest / quarter**2
 
 
 def reset_probe(probe: np.void) -> None:

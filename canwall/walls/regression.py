@@ -139,7 +139,7 @@ def set_regression(
         delay: D in periods.
         shaft: What joins rotor and handle. Default: they are one.
     """
-    regression["period"], regression["resolution"] = period, abs(count)
+    regression["period"], regression["resolution"] = period, count
     regression["rotor"] = shaft.rotor if shaft else 0.0
     regression["softness"] = 1.0 / (shaft.stiffness * period**2) if shaft else 0.0
     regression["lightest"] = lightest - regression["rotor"]
@@ -147,11 +147,11 @@ def set_regression(
     set_swing(regression["swing"][0], period, count)
     bandwidth = _OBSERVER_HZ / (OBSERVER_SLOWER_BEHIND_SHAFT if shaft else 1)
     regression["gain"] = gain = _observer_gain(bandwidth, period)
-    regression["surprise"][5] = abs(count)
+    regression["surprise"][5] = count
     regression["hand_torque"] = HAND_RATE * period / gain[2]
     walk = 0.0 if shaft else _HAND_RATE_WALK
     regression["hand_change"] = walk * math.sqrt(period) * period / gain[2]
-    least_way = _LEAST_WAY * abs(count)
+    least_way = _LEAST_WAY * count
     regression["way_samples"] = min(max(round(least_way / (_TOLD_FROM_REST * period)), 1), _RECENT)
     regression["moving"] = max(round(_STEADY_S / period), _STEADY)
 

@@ -61,7 +61,7 @@ def set_swing(swing: np.void, period: float, count: float) -> None:
         count: One count of the encoder [rad].
     """
     swing["shortest"], swing["longest"] = round(_SHORTEST_S / period), round(_LONGEST_S / period)
-    swing["least_way"], swing["least_square"] = _LEAST_WAY * abs(count), (_NOISE * count) ** 2
+    swing["least_way"], swing["least_square"] = _LEAST_WAY * count, (_NOISE * count) ** 2
 
 
 @compiled

@@ -308,7 +308,7 @@ def test_stiffest_walls_of_long_delays_and_coarse_encoders() -> None:
     twice = stiffest_walls(masses, 3.7, PERIOD, 1e-9, 0.08)
     np.testing.assert_allclose(twice, at_185 / 2.0**5)
     assert np.all(stiffest_walls(masses, 1.7, PERIOD, 1e-9, 0.08) > masses / PERIOD**2)
-    coarse = stiffest_walls(masses, 1.85, PERIOD, -6.3e-4, 0.04)
+    coarse = stiffest_walls(masses, 1.85, PERIOD, 6.3e-4, 0.04)
     np.testing.assert_allclose(coarse, [83.0, 2.2 * 0.04 / 6.3e-4])
 
 
