@@ -56,7 +56,8 @@ def doctor(
 
     findings = Findings()
     try:
-        diagnose(settings, REQUIRED_OBJECTS, announce, findings, move)
+        with stop_on_signals(held=False):
+            diagnose(settings, REQUIRED_OBJECTS, announce, findings, move)
     finally:
         if not as_json and findings.lines:
             _print_findings(findings)
@@ -84,7 +85,7 @@ def dbc(
     from canwall.drive import REQUIRED_OBJECTS
     from canwall.run import on_the_bus
 
-    with on_the_bus(*many) as link:
+    with stop_on_signals(held=False), on_the_bus(*many) as link:
         drives = [mapped_drive(link, settings, REQUIRED_OBJECTS) for settings in many]
     text = dbc_text(drives)
     try:

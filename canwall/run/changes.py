@@ -333,6 +333,8 @@ def _parse_change(assignments: Sequence[str]) -> Request:
     values: dict[str, Any] = {"do": "change"}
     for assignment in assignments:
         key, _, value = assignment.partition("=")
+        if key.strip() == "do":
+            raise ConfigError("do: unknown key; `canwall change` changes the wall alone")
         table = values
         *path, name = key.strip().removeprefix("wall.").split(".")
         for part in path:

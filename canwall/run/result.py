@@ -169,7 +169,7 @@ def _remarks_on_guard(axis: WallAxis) -> list[str]:
     if not found["alarms"]:
         return []
     done = 'guard.action = "act" would make it softer'
-    if found["action"] == "act":
+    if found["least_force"] < 1.0:
         done = f"its force was lowered, to {found['least_force']:.2g} of the law's at the least"
     times = "once" if found["alarms"] == 1 else f"{found['alarms']} times"
     return [f"guard: the wall buzzed {times}, first at {found['first_alarm_s']:.3f} s; {done}"]

@@ -63,6 +63,27 @@ def test_syncs_count_where_time_is_theirs(start: Start, tmp_path: Path, channel:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_doctor_that_is_stopped_puts_the_drive_back(
+    start: Start, tmp_path: Path, channel: Path, number: signal.Signals
+) -> None:
+    bench = drive_file(tmp_path, channel, 'kind = "silence"\nat_s = 999.0\nduration_s = 0.1')
+    drive = start(COMMAND, "drive", bench, "--real-time")
+    assert drive.stdout is not None
+    assert drive.stdout.readline().startswith("simulated drive, node 5")
+    doctor = start(COMMAND, "doctor", bench)
+    assert doctor.stderr is not None
+    for line in doctor.stderr:
+        if "enabling the drive with zero torque" in line:
+            break
+    doctor.send_signal(number)
+    said, errors = doctor.communicate(timeout=PATIENCE_S)
+    assert doctor.returncode == 130
+    assert "changes: all undone" in said
+    assert errors.splitlines()[-1] == "canwall: interrupted"
+
+
+@pytest.mark.slow
 def test_tells_that_it_is_ready(tmp_path: Path, channel: Path) -> None:
     fault = 'kind = "silence"\nat_sync = 0\nduration_syncs = 1'
     ours, its = os.pipe()

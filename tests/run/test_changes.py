@@ -387,6 +387,7 @@ def test_change_that_waits_at_the_end_of_the_run_is_refused(
         ),
         (["stiffness_nm_per_rad=-1"], "stiffness_nm_per_rad: has to be greater than or equal to 0"),
         (["limits.torque=1"], "limits.torque: unknown key; did you mean torque_nm?"),
+        (["do=end"], "do: unknown key"),
         (["options=1", "options.length=2"], "options.length: options has a value of its own"),
     ],
 )

@@ -39,6 +39,9 @@ def test_a_wall_that_buzzed_is_named() -> None:
         "guard: the wall buzzed 2 times, first at 0.280 s; its force was lowered, to 0.1 of the "
         "law's at the least"
     ]
+    turned_on_later = axis_after("warn", 1)
+    turned_on_later.guard.action = "act"
+    assert "would make it softer" in _remarks_on_guard(turned_on_later)[0]
     assert _remarks_on_guard(axis_after("warn", 1)) == [
         'guard: the wall buzzed once, first at 0.280 s; guard.action = "act" would make it softer'
     ]
