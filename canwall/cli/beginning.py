@@ -91,16 +91,18 @@ def init(
     ] = None,
     cycle: Annotated[float, typer.Option(min=1e-4, max=0.1, help="Period of the SYNC [s].")] = 1e-3,
     rated_torque: Annotated[
-        float | None, typer.Option(min=1e-6, help="Rated torque of the motor [N·m].")
+        float | None, typer.Option(min=1e-6, max=1e6, help="Rated torque of the motor [N·m].")
     ] = None,
     counts: Annotated[
-        float | None, typer.Option(min=1.0, help="Increments of 0x6064 per turn of the motor.")
+        float | None,
+        typer.Option(min=1.0, max=2.0**32, help="Increments of 0x6064 per turn of the motor."),
     ] = None,
     gear: Annotated[
-        float | None, typer.Option(min=1e-6, help="Turns of the motor per turn of the shaft.")
+        float | None,
+        typer.Option(min=1e-6, max=1e6, help="Turns of the motor per turn of the shaft."),
     ] = None,
     inertia: Annotated[
-        float, typer.Option(min=1e-9, help="Inertia of drive and handle [kg·m²], roughly.")
+        float, typer.Option(min=1e-9, max=1e3, help="Inertia of drive and handle [kg·m²], roughly.")
     ] = 1e-4,
     output: Annotated[Path, typer.Option(metavar="FILE", help="File to write.")] = Path(
         "bench.toml"

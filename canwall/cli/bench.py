@@ -100,7 +100,7 @@ def dbc(
 def latency(
     config_file: ConfigArgument = None,
     duration: Annotated[
-        float, typer.Option(min=0.1, help="Seconds of each phase: idle, and under load.")
+        float, typer.Option(min=0.1, max=1e6, help="Seconds of each phase: idle, and under load.")
     ] = 10.0,
     load: Annotated[
         int | None,

@@ -27,7 +27,9 @@ def identify(
     ] = False,
     inertia: Annotated[
         float | None,
-        typer.Option(min=1e-9, help="True inertia [kg·m²], for the scale of the torque constant."),
+        typer.Option(
+            min=1e-9, max=1e3, help="True inertia [kg·m²], for the scale of the torque constant."
+        ),
     ] = None,
     output: Annotated[Path | None, typer.Option(help="Folder of the record and report.")] = None,
     eds: EdsOption = None,

@@ -33,7 +33,9 @@ _Laws = Annotated[
         autocompletion=complete_law,
     ),
 ]
-_Seconds = Annotated[float, typer.Option(min=0.5, help="Seconds for which a wall is rendered.")]
+_Seconds = Annotated[
+    float, typer.Option(min=0.5, max=1e6, help="Seconds for which a wall is rendered.")
+]
 
 
 @study.command()
