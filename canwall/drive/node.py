@@ -148,7 +148,14 @@ class DriveNode:
             before = self._upload(index, subindex)
         except DriveError:
             before = None
-        self.write(index, subindex, value, size)
+        try:
+            self.write(index, subindex, value, size)
+        except DriveError:
+            # The answer may be lost, and the value written nevertheless.
+            with contextlib.suppress(DriveError):
+                if before is not None and self._upload(index, subindex) != before:
+                    self._changes.append((index, subindex, before))
+            raise
         self._changes.append((index, subindex, before))
 
     def set(self, index: int, subindex: int, value: int) -> None:

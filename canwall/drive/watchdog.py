@@ -90,10 +90,11 @@ def arm(
     for kind, set_watchdog in kinds:
         try:
             held_s, frame, period_s = set_watchdog()
+            reaction = _set_reaction(node)
         except DriveError as error:
             passed_over.append(f"{kind}: {error}")
         else:
-            return Watchdog(kind, held_s, frame, period_s, _set_reaction(node), tuple(passed_over))
+            return Watchdog(kind, held_s, frame, period_s, reaction, tuple(passed_over))
     if accept_none:
         return Watchdog("none", passed_over=tuple(passed_over))
     raise DriveError(
@@ -146,6 +147,8 @@ def _consumer_heartbeat(
     free = [i for i, value in present.items() if not value & 0xFFFF or value >> 16 == master_id]
     if not free:
         raise DriveError("0x1016: every entry watches another node")
+    # No two entries may watch one node: that of a master before us comes first.
+    free.sort(key=lambda i: present[i] >> 16 != master_id)
     # An entry in use has to be switched off before it is changed.
     if present[free[0]]:
         node.set(od.CONSUMER_HEARTBEAT_TIME, free[0], 0)
@@ -179,6 +182,8 @@ def _set_reaction(node: DriveNode) -> str:
         kept = node.read(od.ABORT_CONNECTION_OPTION_CODE)
         if kept in _REACTIONS:
             return f"{_REACTIONS[kept]} (0x6007 = {kept}, as the drive has it)"
+        if kept == 0:
+            raise DriveError("0x6007 = 0, no action, and the drive lets nobody change it")
     if node.has(od.ERROR_BEHAVIOUR, 1):
         # 1 would keep the NMT state, and with it the last torque of the RPDO.
         if node.read(od.ERROR_BEHAVIOUR, 1) == 1:

@@ -1,5 +1,6 @@
 """Set-up of the watchdog: its choice, its time, the master's frames for it, and its effect."""
 
+import contextlib
 import math
 
 import pytest
@@ -49,11 +50,12 @@ def test_an_entry_that_watches_another_node_is_left_alone(make_rig: RigFactory) 
     assert rig.node.read(0x1016, 2) == 0x7F0064
 
 
-def test_an_entry_of_a_predecessor_is_taken_over(make_rig: RigFactory) -> None:
+@pytest.mark.parametrize("entry", [1, 2])
+def test_an_entry_of_a_predecessor_is_taken_over(make_rig: RigFactory, entry: int) -> None:
     rig = rig_without(make_rig, 0x1400)
-    rig.node.write(0x1016, 1, 0x7F01F4)
-    rig.set_up()
-    assert rig.node.read(0x1016, 1) == 0x7F0064
+    rig.node.write(0x1016, entry, 0x7F01F4)
+    assert rig.set_up().watchdog.kind == "consumer heartbeat"
+    assert rig.node.read(0x1016, entry) == 0x7F0064
 
 
 def test_then_life_guarding(make_rig: RigFactory) -> None:
@@ -118,6 +120,38 @@ def test_reaction(make_rig: RigFactory, refused: tuple[int, ...], said: str) -> 
 
     rig.tampering.drive.process = refusing  # type: ignore[method-assign]
     assert rig.set_up().watchdog.reaction == said
+
+
+def test_watchdog_that_does_nothing_is_none(make_rig: RigFactory) -> None:
+    rig = rig_without(make_rig)
+    rig.node.write(0x6007, 0, 0)
+    rig.tampering.read_only[0x6007, 0] = READ_ONLY
+    with pytest.raises(DriveError, match=r"no watchdog, .*0x6007 = 0, no action"):
+        rig.set_up()
+
+
+@pytest.mark.parametrize("parameter", [(0x6007, 0), (0x1400, 5), (0x6060, 0)])
+def test_change_whose_answer_is_lost_is_undone(
+    make_rig: RigFactory, parameter: tuple[int, int]
+) -> None:
+    rig = rig_without(make_rig, sdo_timeout_s=0.1)
+    before = rig.node.read(*parameter)
+    process, lost = rig.tampering.drive.process, []
+
+    def losing(can_id: int, data: bytes) -> list[tuple[int, bytes]]:
+        answers = process(can_id, data)
+        written = data[0] >> 5 == 1 and (int.from_bytes(data[1:3], "little"), data[3]) == parameter
+        if can_id == 0x605 and written and not lost:
+            lost.append(data)
+            return [frame for frame in answers if frame[0] != 0x585]
+        return answers
+
+    rig.tampering.drive.process = losing  # type: ignore[method-assign]
+    with contextlib.suppress(DriveError):
+        rig.set_up()
+    assert lost
+    assert rig.node.restore() == []
+    assert rig.node.read(*parameter) == before
 
 
 def test_without_0x6007_the_error_behaviour_must_change_the_state(make_rig: RigFactory) -> None:
