@@ -351,7 +351,7 @@ def predict(estimator: Record, force: float) -> None:
     if not estimator.settled and estimator.gap < _LONGEST_GAP:
         _predict_covariance(estimator)
     estimator.y, estimator.v = _over_period(estimator, estimator.y, estimator.v, estimator.d, force)
-    _put_in_flight(estimator, force)
+    put_in_flight(estimator.in_flight, force)
 
 
 @compiled
@@ -375,10 +375,11 @@ def unit_motion(
 
 
 @compiled
-def _put_in_flight(estimator: Record, force: float) -> None:
+def put_in_flight(in_flight: NDArray[np.float64], force: float) -> None:
+    """Put the newest force before those that are kept, shape (FORCES_KEPT,)."""
     for age in range(FORCES_KEPT - 1, 0, -1):
-        estimator.in_flight[age] = estimator.in_flight[age - 1]
-    estimator.in_flight[0] = force
+        in_flight[age] = in_flight[age - 1]
+    in_flight[0] = force
 
 
 @compiled
@@ -416,7 +417,7 @@ def start_lagging(lagging: Record, force: float) -> None:
     """
     lagging.delay_periods += 1
     lagging.told += 1.0
-    _put_in_flight(lagging, force)
+    put_in_flight(lagging.in_flight, force)
 
 
 @compiled

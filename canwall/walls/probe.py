@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
-from canwall.walls.estimator import FORCES_KEPT, MAX_DELAY
+from canwall.walls.estimator import FORCES_KEPT, MAX_DELAY, put_in_flight
 
 #: A probe.
 PROBE = np.dtype(
@@ -107,7 +107,5 @@ def other_torque_acts(probe: Record, in_flight: NDArray[np.float64], delay_perio
 @compiled
 def send_probe(probe: Record, force: float) -> None:
     """Note the part of a probe in the force that is sent, as it is rounded."""
-    for age in range(FORCES_KEPT - 1, 0, -1):
-        probe.in_flight[age] = probe.in_flight[age - 1]
-    probe.in_flight[0] = force if probe.acts else 0.0
+    put_in_flight(probe.in_flight, force if probe.acts else 0.0)
     probe.acts = False
