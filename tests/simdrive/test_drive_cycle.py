@@ -89,6 +89,21 @@ def test_dividing_a_period_changes_nothing(
         assert parts.speed_rad_s == pytest.approx(whole.speed_rad_s, rel=0.0, abs=1e-10)
 
 
+@pytest.mark.parametrize("phase", [0.0, 1.0])
+@pytest.mark.parametrize("cycle", [0.125e-3, 0.2e-3, 0.1e-3, 0.05e-3])
+def test_a_cycle_that_divides_the_period_ticks_with_the_sync(cycle: float, phase: float) -> None:
+    """A demand acts one cycle after the SYNC, and the position is that of the SYNC, each period."""
+    motion = servo(drive_cycle_s=cycle, clock_ppm=0.0, clock_phase=phase)
+    motion.advance(0.0, PERIOD)
+    for j in range(1, 400):
+        torque = 0.1 * (-1) ** j
+        before = motion.speed_rad_s
+        motion.advance(torque, PERIOD)
+        gained = (torque * (PERIOD - cycle) - (torque if j > 1 else 0.0) * cycle) / 1e-4
+        assert motion.speed_rad_s - before == pytest.approx(gained, rel=1e-6)
+        assert motion.counts() == counts_of(motion.position_rad)
+
+
 def test_latch_before_and_apply_after_make_one_drive_cycle_at_any_phase() -> None:
     """The delay from position to torque, found from the motion alone."""
     cycle = 0.25e-3

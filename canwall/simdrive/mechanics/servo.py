@@ -170,12 +170,16 @@ def move_servo(
         _latch(servos)
         return servo.latched_counts
     tick = servo.until_tick
-    if tick > duration:
+    rounding = 1e-9 * servo.drive_cycle
+    if tick > duration + rounding:
         _move_on(servos, push, slope, duration)
         servo.until_tick = tick - duration
         return servo.latched_counts
-    # Between the first and the last tick nothing changes.
-    last = tick + math.floor((duration - tick) / servo.drive_cycle) * servo.drive_cycle
+    # Between the first and the last tick nothing changes. A tick at the end belongs to this period:
+    # rounding must not put it into the next one now and then.
+    ticks = math.floor((duration + rounding - tick) / servo.drive_cycle)
+    last = min(tick + ticks * servo.drive_cycle, duration)
+    tick = min(tick, last)
     done = 0.0
     if demand != servo.demand:
         _move_on(servos, push, slope, tick)
