@@ -80,6 +80,27 @@ def test_peak_torque_of_the_hardware(enabled: MakeBench) -> None:
     assert bench.read(0x6041) & LIMITED
 
 
+@pytest.mark.parametrize("rated_mnm", [1, 200, 637, 5000, 2**32 - 1])
+def test_peak_torque_stays_where_the_bus_changes_its_unit(
+    enabled: MakeBench, rated_mnm: int
+) -> None:
+    bench = enabled(Hardware(peak_torque_nm=2 * RATED_NM))
+    bench.drive.dictionary[0x6076, 0].access = "rw"  # as many drives have it
+    given = set(pull(bench, 2000, 3))
+    assert given == {2000}
+    bench.write(0x6076, rated_mnm)
+    bench.write(0x6071, 32767)
+    bench.sync()
+    assert abs(bench.flywheel.pulled_nm) <= 2 * RATED_NM * (1 + 1e-9)
+    assert bench.read(0x6077) * rated_mnm * 1e-6 == pytest.approx(bench.flywheel.pulled_nm)
+
+
+def test_torque_beyond_what_its_object_holds_is_shown_as_the_largest(enabled: MakeBench) -> None:
+    bench = enabled(Hardware())
+    bench.drive.axis.show_torque(-40 * RATED_NM)
+    assert bench.drive.dictionary[0x6077, 0].upload() == (-32767).to_bytes(2, "little", signed=True)
+
+
 def test_max_current_limits_as_max_torque_does(enabled: MakeBench) -> None:
     bench = enabled(Hardware())
     bench.write(0x6073, 400)

@@ -43,12 +43,15 @@ def warns(drives: NDArray[np.void], used: float) -> bool:
 class Overload:
     """The budget of a motor."""
 
-    def __init__(self, state: DriveRecord, peak: float, overload_s: float) -> None:
-        """Begin cold; at the peak torque the budget lasts for ``overload_s``."""
+    def __init__(self, state: DriveRecord, overload_s: float) -> None:
+        """Take the time that the budget lasts at the peak torque."""
         self._record, self._state = state.record, state.fields
+        self._overload_s = overload_s
+
+    def set_peak(self, peak: float) -> None:
+        """Set the peak torque, and with it the budget."""
         self._state.peak = peak
-        self._state.budget = max(0.0, peak**2 - _RATED**2) * overload_s
-        self.reset()
+        self._state.budget = max(0.0, peak**2 - _RATED**2) * self._overload_s
 
     @property
     def warning(self) -> bool:

@@ -107,7 +107,7 @@ class PowerDriveSystem:
 
     def reset(self) -> None:
         """Begin in NOT READY TO SWITCH ON, with the objects as they stand."""
-        self._torque.overload.reset()
+        self._torque.reset()
         self._feedback.reset()
         self._obeyed = None
         self.undervoltage(self._undervoltage)

@@ -24,6 +24,8 @@ _NO_LIMIT = 1 << 31
 _RATED = 1000
 _PEAK = 3000.0
 """Peak torque in per mille of the rated one, where the hardware does not say."""
+_LARGEST = 0x7FFF
+"""Limit of an INTEGER16, which torques are on the bus."""
 
 
 @compiled
@@ -66,7 +68,8 @@ def show_torque(drives: NDArray[np.void], torque_nm: float) -> None:
     """Show a torque that is not the one demanded, in 0x6077 and 0x6078."""
     values = drives[0].values
     scale = nm_per_mille(drives)
-    values[TORQUE] = values[CURRENT] = int(np.rint(torque_nm / scale)) if scale != 0.0 else 0
+    shown = int(np.rint(torque_nm / scale)) if scale != 0.0 else 0
+    values[TORQUE] = values[CURRENT] = max(-_LARGEST, min(_LARGEST, shown))
 
 
 class TorquePath:
@@ -91,14 +94,28 @@ class TorquePath:
         self._demand = number(0x6074, absent=0)
         self._actual = number(0x6077, absent=0)
         self._current = number(0x6078, absent=0)
-        rated_nm = number(0x6076, absent=0).value * hardware.rated_torque_unit_nm
+        self._rated = number(0x6076, absent=0)
+        self._rated.react = lambda _: self._set_peak()
+        rated_nm = self._rated.default * hardware.rated_torque_unit_nm
         peak = hardware.peak_torque_nm
-        per_mille = 1e3 * peak / rated_nm if peak and rated_nm else _PEAK
-        self.overload = Overload(state, per_mille, hardware.overload_s)
+        self._peak = 1e3 * peak / rated_nm if peak and rated_nm else _PEAK
+        self.overload = Overload(state, hardware.overload_s)
+        self.reset()
         self._state.gear_ratio = hardware.gear_ratio
         self._state.nm_per_rated = hardware.rated_torque_unit_nm / 1e3
         self._state.held = 0
         self._state.limited = False
+
+    def reset(self) -> None:
+        """Begin with a cold motor and the rated torque as it stands."""
+        self._set_peak()
+        self.overload.reset()
+
+    def _set_peak(self) -> None:
+        # What the hardware can do stays the same when the bus changes the unit (0x6076).
+        power_on, rated = self._rated.default, self._rated.value
+        scale = power_on / rated if power_on and rated else 1.0
+        self.overload.set_peak(min(self._peak * scale, _LARGEST))
 
     @property
     def limited(self) -> bool:
