@@ -173,16 +173,25 @@ class DriveNode:
             )
 
     def restore(self) -> list[str]:
-        """Undo all changes in PRE-OPERATIONAL and return a line for each that could not be undone.
-
-        The last change is undone first, so that a PDO is switched off before its mapping changes.
-        """
+        """Undo all changes in PRE-OPERATIONAL; return what `undo` does."""
         try:
             self.command("PRE-OPERATIONAL")
         except can.CanError as error:
             return [f"node {self.node_id}: nothing was restored, the bus failed: {error}"]
+        return self.undo()
+
+    @property
+    def changes(self) -> int:
+        """Number of changes that `undo` would undo."""
+        return len(self._changes)
+
+    def undo(self, kept: int = 0) -> list[str]:
+        """Undo all changes but the first ones; return a line for each that could not be undone.
+
+        The last change is undone first, so that a PDO is switched off before its mapping changes.
+        """
         failures = []
-        while self._changes:
+        while len(self._changes) > kept:
             index, subindex, before = self._changes.pop()
             if before is None:
                 failures.append(f"{_name(index, subindex)} cannot be read, so it is not restored")

@@ -88,11 +88,13 @@ def arm(
         ("life guarding", lambda: _life_guarding(node, time_ms)),
     )
     for kind, set_watchdog in kinds:
+        before = node.changes
         try:
             held_s, frame, period_s = set_watchdog()
             reaction = _set_reaction(node)
         except DriveError as error:
-            passed_over.append(f"{kind}: {error}")
+            # Half set, it might run all the same.
+            passed_over.append("; ".join((f"{kind}: {error}", *node.undo(before))))
         else:
             return Watchdog(kind, held_s, frame, period_s, reaction, tuple(passed_over))
     if accept_none:

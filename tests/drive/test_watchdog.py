@@ -83,6 +83,15 @@ def test_what_is_refused_is_passed_over(make_rig: RigFactory) -> None:
     assert rig.node.read(0x1400, 1) == 0x205
 
 
+def test_what_is_passed_over_is_not_armed(make_rig: RigFactory) -> None:
+    rig = rig_without(make_rig)
+    rig.tampering.lies = {(0x1400, 5): 0, (0x1016, 1): 0}
+    assert rig.set_up().watchdog.kind == "life guarding"
+    rig.tampering.lies = {}
+    assert [rig.node.read(0x1400, i) for i in (1, 5)] == [0x205, 0]
+    assert rig.node.read(0x1016, 1) == 0
+
+
 def test_none_is_refused(make_rig: RigFactory) -> None:
     rig = rig_without(make_rig, 0x1400, 0x1016, 0x100C)
     with pytest.raises(DriveError, match=r"no watchdog.*--accept-no-watchdog"):
