@@ -110,6 +110,7 @@ class ServoDrive:
         self._passes_syncs = True
         self._hardware = hardware or Hardware()
         self._extensions: list[Callable[[Dictionary], None]] = []
+        self._power_on_node_id = node_id
         self._build(dictionary, node_id)
 
     def _build(self, dictionary: Dictionary, node_id: int) -> None:
@@ -150,7 +151,7 @@ class ServoDrive:
             node_id,
             self._bitrate,
             send,
-            partial(self._memory.store_node_id, dictionary),
+            self._store_node_id,
             partial(self._reset, False),
             self._fall_silent,
         )
@@ -243,6 +244,8 @@ class ServoDrive:
 
     def boot(self) -> list[Frame]:
         """Switch the device on: power-on values, boot-up message, PRE-OPERATIONAL state."""
+        # What LSS has not stored is gone with the supply.
+        self._lss.power_on(self._power_on_node_id)
         self._reset(communication_only=False)
         return self.take_outbox()
 
@@ -317,6 +320,10 @@ class ServoDrive:
             and self._recorded.record is not None
             and all(pdo.quiet for pdo in self._event_tpdos)
         )
+
+    def _store_node_id(self, node_id: int) -> None:
+        self._memory.store_node_id(self._dictionary, node_id)
+        self._power_on_node_id = node_id
 
     def _fall_silent(self, duration_ms: int) -> None:
         self._silent_until_ns = self._clock.now_ns + duration_ms * NS_PER_MS

@@ -197,6 +197,31 @@ def test_new_node_id_holds_from_the_next_reset_on(configuring: Bench, reset: int
     assert configuring.give(0x609, read) == [(0x589, bytes.fromhex("43 0012 01 09060000"))]
 
 
+def test_power_off_takes_what_is_not_stored(configuring: Bench) -> None:
+    ask(configuring, 0x11, 9)
+    configuring.drive.switch_off()
+    assert configuring.drive.boot() == [(HEARTBEAT, b"\0")]
+    assert ask(configuring, 0x5E) == []  # in WAITING
+    ask(configuring, 0x04, CONFIGURATION)
+    ask(configuring, 0x11, 9)
+    assert configuring.nmt(RESET_NODE) == [(0x709, b"\0")]
+    assert configuring.drive.boot() == [(HEARTBEAT, b"\0")]
+    ask(configuring, 0x04, CONFIGURATION)
+    ask(configuring, 0x11, 9)
+    assert ask(configuring, 0x17) == [frame(0x17)]
+    assert configuring.drive.boot() == [(0x709, b"\0")]
+
+
+def test_objects_of_the_simulation_stay_with_another_node_id() -> None:
+    simulation = Simulation(objects={"0x6072": 750})
+    drive = make_drive(DriveSettings(node_id=NODE_ID, eds=EDS), simulation, 0.001)
+    drive.boot()
+    for request in (frame(0x04, 1), frame(0x11, 9)):
+        drive.process(REQUEST, request)
+    assert drive.process(0x000, bytes([RESET_NODE, NODE_ID])) == [(0x709, b"\0")]
+    assert drive.drive.dictionary[0x6072, 0].value == 750
+
+
 @pytest.mark.parametrize("node_id", [0, 128, 254])
 def test_node_id_that_is_none(configuring: Bench, node_id: int) -> None:
     assert ask(configuring, 0x11, node_id) == [frame(0x11, 1)]

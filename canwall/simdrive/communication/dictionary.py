@@ -217,6 +217,7 @@ class Dictionary:
         self.node_id = node_id
         self._entries: dict[Key, Entry] = {}
         self._supplied: dict[Key, int] = {}
+        self._power_on: dict[Key, int] = {}
         self._state: DriveRecord | None = None
         self.dummies: dict[int, int] = {}
         """Sizes in bytes of the data types that an RPDO may map to skip bytes ([DummyUsage])."""
@@ -253,6 +254,8 @@ class Dictionary:
             DictionaryError: the file cannot be read any more.
         """
         other = Dictionary.load(self.source, node_id)
+        for key, value in self._power_on.items():
+            other.power_on_with(*key, value)
         for key, value in self._supplied.items():
             other.supply(*key, value)
         return other
@@ -316,6 +319,7 @@ class Dictionary:
         ) != (value,):
             raise self.error(index, subindex, f"cannot hold {value}")
         entry.default = entry.value = value
+        self._power_on[index, subindex] = value
 
     def number(self, index: int, subindex: int = 0, *, absent: int) -> Entry:
         """Return an integer entry that a service works with.

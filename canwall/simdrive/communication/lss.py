@@ -60,7 +60,7 @@ class LssSlave:
         start: Callable[[], None],
         fall_silent: Callable[[int], None],
     ) -> None:
-        """Begin in WAITING.
+        """Serve the identity of the dictionary.
 
         Args:
             dictionary: has the identity object (0x1018).
@@ -72,8 +72,6 @@ class LssSlave:
             fall_silent: called with the milliseconds for which nothing is to be sent, while all
                 nodes change their bit timing.
         """
-        self.node_id = node_id
-        """Pending node-ID, which takes effect at the next reset."""
         self._active_node_id = node_id
         self._bit_timing = _BIT_RATES.get(bitrate)
         self._address = [dictionary.number(0x1018, n, absent=0) for n in range(1, 5)]
@@ -81,6 +79,12 @@ class LssSlave:
         self._store = store
         self._start = start
         self._fall_silent = fall_silent
+        self.power_on(node_id)
+
+    def power_on(self, node_id: int) -> None:
+        """Begin in WAITING, with a node-ID for the reset that follows."""
+        self.node_id = node_id
+        """Pending node-ID, which takes effect at the next reset."""
         self._configuring = False
         self._selected = self._identified = self._scanned = 0
 
