@@ -32,7 +32,10 @@ class Emergency(FaultKind):
     name = "emcy"
     number = 8
     amount = Amount(0x1000, 1, 0xFFFF, "error code", "0x{:04X}")
-    independent = True
+
+    @property
+    def effect(self) -> object:
+        return type(self), self.plan.amount
 
     def begin(self) -> None:
         self.drive.emcy.occurred(self.plan.amount, _SOURCE)

@@ -96,6 +96,11 @@ class FaultKind:
         return (*cls.frame_keys, "amount") if cls.amount else cls.frame_keys
 
     @property
+    def effect(self) -> object:
+        """What overlapping faults share: the last of them to end ends it."""
+        return self if self.independent else type(self)
+
+    @property
     def delay(self) -> int:
         """SYNC periods by which it delays the frames that it meets."""
         return 0

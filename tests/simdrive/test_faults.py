@@ -353,6 +353,29 @@ def test_overlapping_encoder_jumps_end_one_by_one(on_the_bus: BusBenchFactory) -
     assert [position(data) - before for data in bench.tpdos(6)] == [20, 23, 23, 3, 3, 0]
 
 
+def test_encoder_that_jumps_while_it_is_stuck(on_the_bus: BusBenchFactory) -> None:
+    bench = on_the_bus(
+        {"kind": "encoder_stuck", "at_sync": 4, "duration_syncs": 4},
+        {"kind": "encoder_jump", "amount": 20, "at_sync": 5, "duration_syncs": 2},
+        {"kind": "encoder_jump", "amount": 3, "at_sync": 6},
+    ).start()
+    before = bench.read(0x6064, signed=True)
+    assert [position(data) - before for data in bench.tpdos(6)] == [0, 0, 0, 0, 3, 3]
+
+
+def test_overlapping_emergencies_of_one_code_end_with_the_last(on_the_bus: BusBenchFactory) -> None:
+    bench = on_the_bus(
+        {"kind": "emcy", "amount": 0x4210, "at_sync": 4, "duration_syncs": 3},
+        {"kind": "emcy", "amount": 0x4210, "at_sync": 5, "duration_syncs": 3},
+        {"kind": "emcy", "amount": 0x3310, "at_sync": 5, "duration_syncs": 1},
+    ).start()
+    codes = []
+    for _ in range(6):
+        bench.sync()
+        codes.append(bench.read(0x603F))
+    assert codes == [0x4210, 0x3310, 0x4210, 0x4210, 0, 0]
+
+
 @pytest.mark.parametrize("kind", ["sto", "undervoltage"])
 def test_no_power(begun: Begin, kind: str) -> None:
     bench = begun(kind=kind, duration_syncs=5)

@@ -53,16 +53,19 @@ class FaultyEncoder:
     def jump(self, increments: int) -> None:
         """Read this many increments more from now on."""
         self._offset += increments
-        self.counts = self._counts if self._offset else self._motion.counts
+        if not self._stuck:
+            self.counts = self._counts if self._offset else self._motion.counts
 
     def stick(self) -> None:
         """Read the present position from now on, and no speed."""
         stuck_at = self.counts()
+        self._stuck = True
         self.counts = lambda: stuck_at
         self.speed_counts_per_s = float
 
     def release(self) -> None:
         """Read the motion again."""
+        self._stuck = False
         self.speed_counts_per_s = self._motion.speed_counts_per_s
         self.jump(0)
 

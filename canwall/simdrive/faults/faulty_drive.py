@@ -189,8 +189,8 @@ class FaultyDrive:
 
     def _end(self, fault: FaultKind) -> list[Frame]:
         self._present.remove(fault)
-        others = any(other.plan.kind is fault.plan.kind for other in self._present)
-        frames = (fault.end() or []) if fault.independent or not others else []
+        others = any(other.effect == fault.effect for other in self._present)
+        frames = [] if others else fault.end() or []
         self._say(fault, "ends")
         return self._send([*frames, *self.drive.take_outbox()])
 
