@@ -452,6 +452,8 @@ class ServoDrive:
 
     def _entered(self) -> None:
         self._emcy.silent = self._nmt.state is NmtState.STOPPED
+        if self._nmt.state is NmtState.STOPPED:
+            self._sdo.reset()  # an abort after its timeout would break the silence
         self._sync.stop()
         for received in self._rpdos:
             received.stop()

@@ -304,6 +304,16 @@ def client_that_leaves(bench: Bench) -> None:
     raise SdoAbortedError(struct.unpack_from("<L", response, 4)[0])
 
 
+def test_stopped_is_silent_and_ends_a_transfer(bench: Bench) -> None:
+    bench.sdo(initiate(0x40, 0x1008, 0))
+    assert bench.nmt(STOP) == []
+    assert bench.give(SDO_REQUEST, segment(0x60)) == []
+    assert bench.tick(2.0) == []
+    bench.nmt(PRE_OPERATIONAL)
+    with pytest.raises(SdoAbortedError):
+        bench.sdo(segment(0x60))
+
+
 ABORTS: list[tuple[AbortCode, Callable[[Bench], object]]] = [
     (AbortCode.TOGGLE_BIT, upload_with_wrong_toggle),
     (AbortCode.TOGGLE_BIT, download_with_wrong_toggle),
