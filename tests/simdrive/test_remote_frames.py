@@ -46,6 +46,15 @@ def test_heartbeat_goes_before_guarding(bench: Bench) -> None:
     assert bench.request(HEARTBEAT) == []
 
 
+def test_heartbeat_ends_life_guarding(bench: Bench) -> None:
+    watch(bench)
+    bench.request(HEARTBEAT)
+    bench.write(0x1017, 0, 1000, 2)
+    assert bench.tick(200 * MS) == []
+    bench.write(0x1017, 0, 0, 2)
+    assert bench.tick(200 * MS) == []
+
+
 def test_without_guard_time_there_is_no_guarding(tmp_path: Path) -> None:
     path = tmp_path / "unguarded.eds"
     path.write_text(EDS.read_text().replace("[100C]", "[2FFF]"))

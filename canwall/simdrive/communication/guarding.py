@@ -60,6 +60,8 @@ class NodeGuarding:
 
     def tick(self) -> None:
         """Report a master that has been silent for too long, once."""
+        if self._deadline_ns is not None and self._heartbeat_time.value:
+            self._stop()  # no node is guarded and sends heartbeats
         if self._deadline_ns is not None and self._clock.now_ns >= self._deadline_ns:
             self._deadline_ns = None
             self._lost(_LIFE_TIME_FACTOR)
