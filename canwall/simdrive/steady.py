@@ -62,13 +62,14 @@ def _brings_torque_only(drive: Record, rpdo: Record) -> bool:
 
 @compiled
 def _target_torque(drive: Record, rpdo: Record) -> int:
-    """Return the target torque from this SYNC on."""
+    """Return the target torque from this SYNC on; of several in the RPDO the last counts."""
+    target = drive.values[TARGET_TORQUE]
     if rpdo.pending:
         for k in range(rpdo.field_count):
             field = rpdo.fields[k]
             if field.place == TARGET_TORQUE:
-                return signed(rpdo.data >> field.shift, field.bits)
-    return drive.values[TARGET_TORQUE]
+                target = signed(rpdo.data >> field.shift, field.bits)
+    return target
 
 
 @compiled

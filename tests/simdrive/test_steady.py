@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 from simdrive_bench import (
+    CONTROLWORD,
     EDS,
     EMCY,
     NODE_ID,
@@ -13,6 +14,7 @@ from simdrive_bench import (
     RPDO,
     SDO_REQUEST,
     SYNC,
+    TARGET_TORQUE,
     TPDO,
     Bench,
 )
@@ -143,6 +145,16 @@ def test_sync_that_has_to_carry_its_counter_is_for_the_services() -> None:
         assert can_id == TPDO[3]
     assert not bench.steady
     assert [can_id for can_id, _ in bench.sync()] == [EMCY]
+
+
+def test_of_a_torque_that_is_mapped_twice_the_last_counts() -> None:
+    bench = enabled(Simulation(ideal=True).with_ideal_servo())
+    bench.configure_pdo(0x1402, RPDO[3], 1, [CONTROLWORD, TARGET_TORQUE, TARGET_TORQUE])
+    bench.sync()
+    for torque in (100, 200):
+        bench.give(RPDO[3], struct.pack("<Hhh", 0x0F, 700, torque))
+        assert bench.steady
+        assert bench.cycle()[2] == torque
 
 
 def test_fault_from_outside_ends_it() -> None:
