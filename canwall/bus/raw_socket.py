@@ -222,7 +222,7 @@ def send(
     While the socket's transmit buffer is full (EAGAIN) it is waited for, no longer than
     `patience_ns`; while the interface's queue is (ENOBUFS), no longer than QUEUE_PATIENCE_NS.
     """
-    queue_until = 0
+    queue_until = room_until = 0
     frame = port.frame[0]
     frame.can_id = can_id
     frame.length = length
@@ -240,6 +240,8 @@ def send(
                 return FAILED
             sleep_until(port, now + QUEUE_RETRY_NS)
             continue
-        if port.errno != _EAGAIN or not _poll(port, descriptor, _POLLOUT, patience_ns):
+        now = now_ns(port)
+        room_until = room_until or now + patience_ns
+        if port.errno != _EAGAIN or now >= room_until:
             return FAILED
-        patience_ns = 0
+        _poll(port, descriptor, _POLLOUT, room_until - now)  # a signal may end it before
