@@ -120,24 +120,25 @@ def _pdo(drive: MappedDrive, layout: PdoLayout, name: str, sender: str) -> Messa
         _TORQUE_DEMAND: torque,
         od.TORQUE_ACTUAL_VALUE: torque,
     }
-    signals = []
+    signals: dict[str, Signal] = {}
     for field in layout.fields:
         if field.index < _FIRST_OBJECT:
             continue
         variable = drive.dictionary.get_variable(field.index, field.subindex)
         scale, unit = scales.get(field.index, (1, None))
-        signals.append(
-            Signal(
-                _symbol(variable.name if variable else "", field.index, field.subindex),
-                field.shift,
-                field.bits,
-                is_signed=variable is not None and variable.data_type in datatypes.SIGNED_TYPES,
-                conversion=BaseConversion.factory(scale=scale),
-                unit=unit,
-                comment=f"0x{field.index:04X}:{field.subindex:02X}",
-            )
+        symbol = _symbol(variable.name if variable else "", field.index, field.subindex)
+        while symbol in signals:
+            symbol += f"_{field.index:04X}_{field.subindex:02X}"
+        signals[symbol] = Signal(
+            symbol,
+            field.shift,
+            field.bits,
+            is_signed=variable is not None and variable.data_type in datatypes.SIGNED_TYPES,
+            conversion=BaseConversion.factory(scale=scale),
+            unit=unit,
+            comment=f"0x{field.index:04X}:{field.subindex:02X}",
         )
-    return Message(layout.cob_id, name, layout.length, signals, senders=[sender])
+    return Message(layout.cob_id, name, layout.length, [*signals.values()], senders=[sender])
 
 
 def _symbol(words: str, index: int, subindex: int) -> str:

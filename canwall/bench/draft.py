@@ -160,7 +160,9 @@ def _drive_keys(drive: DriveSettings, output: Path) -> str:
     lines = [_line(key, value, comments.get(key, "")) for key, value in keys.items()]
     if drive.parameters:
         lines += ["", "[drive.parameters]             # written at the set-up"]
-        lines += [f'"{name}" = {value:#x}' for name, value in drive.parameters.items()]
+        for name, value in drive.parameters.items():
+            # TOML has no negative hexadecimal numbers.
+            lines.append(f'"{name}" = {value:{"#x" if value >= 0 else "d"}}')
     return "\n".join(lines)
 
 

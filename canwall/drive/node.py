@@ -120,8 +120,9 @@ class DriveNode:
         return int.from_bytes(raw, "little", signed=signed)
 
     def read_text(self, index: int, subindex: int = 0) -> str:
-        """Read a VISIBLE_STRING. Raises DriveError."""
-        return self._upload(index, subindex).decode("latin-1").rstrip("\0 ")
+        """Read a VISIBLE_STRING, "?" for what is not visible. Raises DriveError."""
+        text = self._upload(index, subindex).decode("latin-1").rstrip("\0 ")
+        return "".join(c if c.isprintable() else "?" for c in text)
 
     def write(self, index: int, subindex: int, value: int, size: int | None = None) -> None:
         """Write an integer; its size in bytes is the dictionary's unless given.

@@ -6,7 +6,9 @@ import cantools
 import numpy as np
 import pytest
 from commands import Record, command
-from rig import SIM_CONFIG
+from rig import SIM_CONFIG, RigFactory
+
+from canwall.bench.dbc import MappedDrive, dbc_text
 
 
 @pytest.fixture(scope="session")
@@ -68,3 +70,16 @@ def test_file_that_cannot_be_written(tmp_path: Path) -> None:
     done = command("dbc", SIM_CONFIG, "--output", tmp_path / "none" / "bus.dbc")
     assert done.returncode == 2
     assert done.stderr.endswith("none/bus.dbc: cannot be written: No such file or directory\n")
+
+
+def test_objects_of_one_name_are_told_apart(make_rig: RigFactory) -> None:
+    rig = make_rig()
+    setup, dictionary = rig.set_up(), rig.node.dictionary
+    for field in setup.tpdo.fields:
+        dictionary[field.index].name = "Actual value"
+    text = dbc_text([MappedDrive(5, dictionary, setup, ())])
+    signals = cantools.database.load_string(text).get_message_by_name("Drive5_TPDO1").signals
+    _, *others = setup.tpdo.fields
+    assert sorted(signal.name for signal in signals) == sorted(
+        ["Actual_value", *(f"Actual_value_{field.index:04X}_00" for field in others)]
+    )

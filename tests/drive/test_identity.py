@@ -33,3 +33,8 @@ def test_identity_is_kept(rig: Rig) -> None:
     identity = rig.set_up().identity
     assert identity is not None
     assert identity.numbers == {i: rig.node.read(0x1018, i) for i in (1, 2, 3, 4)}
+
+
+def test_text_has_no_control_characters(rig: Rig) -> None:
+    rig.tampering.invented[0x1008, 0] = int.from_bytes(b"a\n\x1bb", "little")
+    assert rig.node.read_text(0x1008) == "a??b"
