@@ -12,11 +12,11 @@ EDS = SIM_CONFIG.parent.parent / "eds" / "canwall-drive.eds"
 
 @pytest.fixture
 def dcf(tmp_path: Path) -> Path:
-    """Our drive's EDS with values for 0x6072, the PDOs and the target torque."""
+    """Our drive's EDS with values for 0x6072, a PDO, the target torque and what is read only."""
     lines = []
     for line in EDS.read_text().splitlines():
         lines.append(line)
-        for section, value in (("[6072]", 1234), ("[1800sub3]", 77), ("[6071]", 99)):
+        for section, value in (("[6072]", 1234), ("[1800sub3]", 77), ("[6071]", 99), ("[6077]", 3)):
             if line == section:
                 lines.append(f"ParameterValue={value}")
     path = tmp_path / "drive.dcf"
@@ -44,6 +44,12 @@ def test_download_and_back(make_rig: RigFactory, dcf: Path) -> None:
     assert setup.torque_limit_nm == pytest.approx(1.234 * 0.637)
     assert rig.node.read(0x1800, 3) == 0
     assert rig.node.read(0x6071) == 0
+    written = {
+        data[1:4]
+        for can_id, data in rig.frames
+        if can_id == 0x605 and data[0] >> 5 == 1 and data[4] == 99
+    }
+    assert b"\x71\x60\x00" not in written
     assert rig.node.restore() == []
     assert rig.node.read(0x6072) == 2500
 

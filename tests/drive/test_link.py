@@ -48,6 +48,24 @@ def test_late_answer_after_the_request(make_rig: RigFactory) -> None:
     rig.node.set(0x6071, 0, -5)
 
 
+def test_abort_of_another_request_is_none(rig: Rig) -> None:
+    process = rig.tampering.process
+    abort = struct.pack("<BHBL", 0x80, 0x6041, 0, 0x08000000)
+
+    def late(can_id: int, data: bytes) -> list[tuple[int, bytes]]:
+        return [(SDO_ANSWER, abort), *process(can_id, data)]
+
+    rig.tampering.process = late  # type: ignore[method-assign]
+    assert rig.node.read(0x1000) == 0x20192
+
+
+def test_abort_may_name_no_object(rig: Rig) -> None:
+    abort = struct.pack("<BHBL", 0x80, 0, 0, 0x08000021)
+    rig.tampering.process = lambda *frame: [(SDO_ANSWER, abort)]  # type: ignore[method-assign]
+    with pytest.raises(DriveError, match="0x08000021"):
+        rig.node.read(0x1000)
+
+
 def test_other_frames_do_not_disturb(rig: Rig) -> None:
     for data in (b"", b"\x01", bytes(8)):
         for can_id in (0x000, 0x080, 0x085, 0x123, 0x185, 0x585, 0x705):

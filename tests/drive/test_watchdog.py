@@ -6,8 +6,9 @@ import math
 import pytest
 from rig import Rig, RigFactory, lack, settings_with
 
-from canwall.drive import DriveError, ErrorControlFrame
+from canwall.drive import DriveError, ErrorControlFrame, disarm
 
+PRE_OPERATIONAL = 127
 READ_ONLY = 0x06010002
 REAL_TIME = {"bus.pace": "real_time", "drive.wait_s": 0.0}
 
@@ -90,6 +91,32 @@ def test_what_is_passed_over_is_not_armed(make_rig: RigFactory) -> None:
     rig.tampering.lies = {}
     assert [rig.node.read(0x1400, i) for i in (1, 5)] == [0x205, 0]
     assert rig.node.read(0x1016, 1) == 0
+
+
+@pytest.mark.parametrize(
+    ("missing", "kind", "off"),
+    [
+        ((), "RPDO event timer", [(0x1400, 5)]),
+        ((0x1400,), "consumer heartbeat", [(0x1016, 2)]),
+        ((0x1400, 0x1016), "life guarding", [(0x100C, 0), (0x100D, 0)]),
+    ],
+)
+def test_disarmed(
+    make_rig: RigFactory, missing: tuple[int, ...], kind: str, off: list[tuple[int, int]]
+) -> None:
+    rig = rig_without(make_rig, *missing)
+    if kind == "consumer heartbeat":
+        rig.node.write(0x1016, 1, 0x0901F4)
+    setup = rig.set_up()
+    assert setup.watchdog.kind == kind
+    armed = [rig.node.read(*key) for key in off]
+    disarm(rig.node, setup.rpdo, setup.watchdog)
+    assert 0 not in armed
+    assert not any(rig.node.read(*key) for key in off)
+    assert rig.node.read(0x1400, 1) == 0x205
+    assert rig.tampering.drive.drive.nmt_state == PRE_OPERATIONAL
+    if kind == "consumer heartbeat":
+        assert rig.node.read(0x1016, 1) == 0x0901F4
 
 
 def test_none_is_refused(make_rig: RigFactory) -> None:

@@ -74,14 +74,15 @@ def test_handle_that_something_else_drives_tells_nothing() -> None:
         fit_servo(position, torque, PERIOD, COUNT)
 
 
-def test_break_away_of_a_ramp() -> None:
+@pytest.mark.parametrize("delay", [1.0, 10.0])
+def test_break_away_of_a_ramp(delay: float) -> None:
     """A handle at 0.3 rad that breaks loose at 12 mN·m under 0.2 N·m/s, without other friction."""
     rate, inertia = 0.2, 1e-4
     time = np.arange(-150, 200) * PERIOD
     torque = rate * np.maximum(time, 0.0)
-    free = np.maximum(time - 0.06 - PERIOD, 0.0)
+    free = np.maximum(time - 0.06 - delay * PERIOD, 0.0)
     position = 0.3 + np.round(rate * free**3 / (6.0 * inertia) / COUNT) * COUNT
-    place, loose, uncertain = break_away(position, torque, PERIOD, COUNT, inertia, 1.0)
+    place, loose, uncertain = break_away(position, torque, PERIOD, COUNT, inertia, delay)
     assert place == pytest.approx([0.3])
     assert loose == pytest.approx([0.012], abs=float(uncertain[0]))
     assert uncertain[0] < 0.001

@@ -15,7 +15,7 @@ from canwall.config import Settings
 from canwall.errors import ConfigError
 from canwall.identify import identify
 from canwall.identify.excitation import Bounds, HandExcitation
-from canwall.identify.session import Identification
+from canwall.identify.session import Identification, stiction
 from canwall.record import ROW
 
 #: Changes of config/sim.toml: nobody at the handle, a real current loop, a model that is off.
@@ -118,6 +118,31 @@ def test_stopped_on_the_way(tmp_path: Path) -> None:
     assert (outcome.interrupted, outcome.disabled, outcome.trips) == (True, True, [])
     assert found.servo is None
     assert found.result.summary["interrupted"]
+
+
+@pytest.mark.parametrize("ramps", [3, 4, 5])
+def test_stiction_is_what_is_left_of_both_ways_without_cogging(
+    monkeypatch: pytest.MonkeyPatch, ramps: int
+) -> None:
+    """20 mN·m, a constant torque of 3 mN·m and cogging, in more ramps forwards than backwards."""
+    place = np.linspace(0.0, 1.0, ramps)
+    way = np.where(np.arange(ramps) == 1, -1.0, 1.0)
+    cogging = np.array([0.0, 1.0]), np.array([-0.005, 0.005])
+    torque = 0.02 * way + 0.003 + np.interp(place, *cogging)
+    found = place, torque, np.full(ramps, 1e-3)
+    monkeypatch.setattr("canwall.identify.session.break_away", lambda *_: found)
+    servo = SimpleNamespace(
+        inertia=SimpleNamespace(value=1e-4), delay=SimpleNamespace(value=1.0), cogging=cogging
+    )
+    none = SimpleNamespace(position=None, torque=None, period=1e-3, step=1e-5)
+    holds = stiction(cast(Any, none), cast(Any, servo))
+    if ramps < 4:
+        assert holds is None
+        return
+    assert holds is not None
+    assert holds.value == pytest.approx(0.02)
+    scatter = 2.0 * np.std(0.003 * way, ddof=1) / np.sqrt(ramps)
+    assert holds.half == pytest.approx(np.hypot(scatter, 1e-3))
 
 
 @pytest.mark.parametrize(

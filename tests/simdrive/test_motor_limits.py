@@ -6,8 +6,11 @@ from contextlib import ExitStack
 import pytest
 from bus_bench import COUNTS_PER_RAD, PERIOD_S, RATED_NM, BusBench
 from canopen import SdoAbortedError
-from simdrive_bench import START
+from simdrive_bench import EDS, NODE_ID, START, Bench
 
+from canwall.config import Drive as DriveSettings
+from canwall.config import Simulation
+from canwall.simdrive import make_drive
 from canwall.simdrive.profile.hardware import Hardware
 
 WARNING, LIMITED, VOLTAGE = 1 << 7, 1 << 11, 1 << 4
@@ -78,6 +81,19 @@ def test_peak_torque_of_the_hardware(enabled: MakeBench) -> None:
     bench = enabled(Hardware(peak_torque_nm=2 * RATED_NM))
     assert set(pull(bench, 2500, 3)) == {2000}
     assert bench.read(0x6041) & LIMITED
+
+
+def test_peak_torque_of_the_configuration() -> None:
+    bench = Bench()
+    simulation = Simulation(peak_torque_nm=1.5 * RATED_NM).with_ideal_servo()
+    bench.drive = make_drive(  # type: ignore[assignment]
+        DriveSettings(node_id=NODE_ID, eds=EDS), simulation, PERIOD_S
+    )
+    bench.drive.boot()
+    bench.configure_cycle()
+    bench.enable()
+    bench.command(0x0F, 3000)
+    assert bench.cycle()[2] == 1500
 
 
 @pytest.mark.parametrize("rated_mnm", [1, 200, 637, 5000, 2**32 - 1])
