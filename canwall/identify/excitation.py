@@ -29,6 +29,9 @@ _REVERSAL_S, _FASTEST_SWEEP_S = 0.15, 0.25
 _SWEEPS = ((1.0, 10.0), (0.5, 9.0), (0.2, 8.0), (0.07, 6.0))
 #: Change of the speed by the signal on top, as a part of that of the sweep.
 _RIPPLE = 0.3
+#: Part of the signal on top that a rotor at the end of an elastic shaft bears, with which a sweep
+#: begins, and factors a cycle by which it grows and shrinks.
+_FIRST_GAIN, _GROWS, _SHRINKS = 0.05, 1.004, 0.99
 #: Largest torque of the signal on top, as a part of the largest one.
 _ON_TOP = 0.7
 #: Duration of a ramp, of the rest before it, and their number [s].
@@ -90,7 +93,7 @@ class Excitation:
         self._torques: Iterator[float] | None = None
         self._position = self._speed = self._moved = 0.0
         #: Mean square of the change of the speed from cycle to cycle, and the gain against it.
-        self._jolt, self._gain = 0.0, 1.0
+        self._jolt, self._gain = 0.0, _FIRST_GAIN
 
     def next(self, position: float, periods: int = 1) -> float | None:
         """Return the torque after a position [N·m], None at the end.
@@ -182,7 +185,7 @@ class Excitation:
             moving += min(max(direction * speed - moving, -rate * period), rate * period)
             reference += moving * period
             # A shaft may swing, and the inertia be far less than that of the configuration.
-            self._gain *= 0.995 if self._jolt > (_RIPPLE * speed) ** 2 else 1.001
+            self._gain *= _SHRINKS if self._jolt > (_RIPPLE * speed) ** 2 else _GROWS
             self._gain = min(self._gain, 1.0)
             on_top = min(max(amplitude * one, -most), most)
             wanted = self._loop(reference, moving) + self._gain * on_top

@@ -47,6 +47,10 @@ _MOST_DELAY = 4.0
 #: Errors of the model that no residual shows: of the delay [periods], of the lag (relative) and of
 #: their sum [periods]; a shaft makes it harder to tell them apart.
 _APART, _APART_ELASTIC = (0.008, 0.05, 0.003), (0.02, 0.12, 0.006)
+#: First values of delay and lag together behind a soft shaft [periods], and how many guesses of a
+#: resonance are refined.
+_TOTALS: tuple[float, ...] = (0.35, 0.85, 1.35, 1.85, 2.35, 2.85)
+_REFINED = 3
 #: Lags over which the residuals' autocorrelation is reported.
 _CORRELATED = 5
 
@@ -231,16 +235,21 @@ class _Fit:
         nyquist = 0.5 / self._period
         before = self._cost(rigid)
         lag = min(rigid[0] * rigid[1], 0.15)
-        totals = [max(rigid[0] - late, 0.05) for late in (0.0, 0.15)]
+        # A soft shaft leaves nothing to a rigid fit, and its delay is no guess.
+        totals = [*(max(rigid[0] - late, 0.05) for late in (0.0, 0.15)), *_TOTALS]
+        frequencies = np.geomspace(0.08 * nyquist, 1.6 * nyquist, 40)
         guesses = [
-            np.array([total, min(lag / total, 1.0), hz, 0.03])
-            for hz in np.geomspace(0.08 * nyquist, 1.6 * nyquist, 40)
-            for total in totals
+            min(
+                (np.array([total, min(lag / total, 1.0), hz, 0.03]) for total in totals),
+                key=self._cost,
+            )
+            for hz in frequencies
         ]
-        best = min(guesses, key=self._cost)
-        if self._cost(best) > (1.0 - _SHAFT_EXPLAINS) * before:
+        guesses.sort(key=self._cost)
+        if self._cost(guesses[0]) > (1.0 - _SHAFT_EXPLAINS) * before:
             return None
-        x = self.refined(best)
+        # A resonance and its image beyond the Nyquist frequency look alike on a coarse grid.
+        x = min((self.refined(guess) for guess in guesses[:_REFINED]), key=self._cost)
         linear, covariance, _ = self._everything(x)
         ratio = linear[1] / linear[0]
         significant = linear[1] > _SHAFT_SIGNIFICANCE * math.sqrt(covariance[5, 5])

@@ -121,6 +121,21 @@ def test_excitation_stays_within_its_bounds() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("hz", "ratio"), [(400.0, 0.02), (250.0, 0.05)])
+def test_small_rotor_of_a_heavy_handle(hz: float, ratio: float) -> None:
+    """Shafts of the presets: the rotor is a tenth, and rings with what moves a rigid handle."""
+    settings = free_settings(1.0e-4)
+    truth = Truth(shaft_hz=hz, shaft_damping=ratio, rotor_part=0.106, drive_cycle=2.5e-4)
+    position, torque = play(settings, truth, Excitation(settings, 1.9))
+    assert np.abs(np.diff(position)).max() / PERIOD < settings.limits.speed_rad_s
+    fit = fit_servo(position, torque, PERIOD, 2.0 * math.pi / truth.counts)
+    assert fit.inertia.value == pytest.approx(truth.inertia, rel=0.02)
+    assert fit.total.value == pytest.approx(truth.total_delay + truth.lag / PERIOD, abs=0.02)
+    assert fit.shaft is not None
+    assert fit.shaft.hz.value == pytest.approx(hz, rel=0.01)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [4, 24])
 def test_random_servo(seed: int) -> None:
     """Two of the thirty: a stiff shaft and an elastic one."""
