@@ -16,6 +16,7 @@ from canwall.cli.options import (
     settings_from,
 )
 from canwall.cli.output import ProgressDisplay, console, print_json, say
+from canwall.errors import InputError
 from canwall.extras import how_to_install, is_installed
 from canwall.stopping import stop_on_signals
 
@@ -39,8 +40,11 @@ def identify(
     """Measure inertia, friction, cogging, delay, current loop and shaft of the free handle.
 
     The handle moves to and fro within the limits of CONFIG for about 40 s: keep clear of it.
-    Ctrl-C ends it at any time. With --hand hold the handle still for 12 s.
+    Ctrl-C ends it at any time. With --hand hold the handle still for 12 s. A simulated hand lets
+    the handle go, or holds it still.
     """
+    if hand and inertia is not None:
+        raise InputError("--inertia is that of the free handle; leave it out with --hand")
     settings = settings_from(
         config_file,
         drive__eds=absolute_path(eds),
@@ -49,8 +53,21 @@ def identify(
     with stop_on_signals(held=False) as stop:
         with ProgressDisplay() as display:
             from canwall.identify import identify as measure
-            from canwall.identify import json_content, report_lines, toml_fragment, write_report
+            from canwall.identify import (
+                json_content,
+                report_lines,
+                toml_fragment,
+                with_simulated_hand_still,
+                write_report,
+            )
 
+            if (
+                settings.embedded
+                and (still := with_simulated_hand_still(settings, hand)) != settings
+            ):
+                does = "holds the handle still" if hand else "lets the handle go"
+                say(f"the simulated hand {does}, whatever [simulation.hand] says")
+                settings = still
             gc.freeze()  # modules stay; the collector need not visit them
             found = measure(settings, output, hand, display.report, display.advance)
         result = found.result

@@ -4,7 +4,7 @@ from canwall.identify.estimates import Estimate, ServoFit, Shaft, UntellingDataE
 from canwall.identify.fit import fit_servo
 from canwall.identify.hand import HandFit, fit_hand
 from canwall.identify.report import json_content, report_lines, toml_fragment, write_report
-from canwall.identify.session import Identified, identify
+from canwall.identify.session import Identified, identify, with_simulated_hand_still
 
 __all__ = [
     "Estimate",
@@ -19,5 +19,6 @@ __all__ = [
     "json_content",
     "report_lines",
     "toml_fragment",
+    "with_simulated_hand_still",
     "write_report",
 ]

@@ -103,4 +103,11 @@ def fit_hand(position: Array, torque: Array, period: float, settings: Settings) 
         Estimate(float(value) - part, math.hypot(half, 0.02 * float(value)))
         for value, part, half in zip(values, free, halves, strict=True)
     )
+    for name, found in (("inertia", inertia), ("damping", damping), ("stiffness", stiffness)):
+        if found.low < 0.0:
+            raise UntellingDataError(
+                f"the data do not tell the operator's {name}, which cannot be negative: "
+                f"{found.value:.3g} [{found.low:.3g}, {found.high:.3g}]; hold the handle still, "
+                f"give more estimator.measure_torque_nm, and [mechanics] of the free handle"
+            )
     return HandFit(inertia, damping, stiffness, explained)

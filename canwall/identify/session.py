@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -178,6 +179,21 @@ def identify(
         return Identified(result, measured, hand=hand)
     servo = fit_servo(measured.position, measured.torque, measured.period, measured.step)
     return Identified(result, measured, servo, stiction(measured, servo))
+
+
+def with_simulated_hand_still(settings: Settings, holding: bool) -> Settings:
+    """Return settings whose simulated hand holds the handle still, or has let it go."""
+    if settings.simulation is None:
+        return settings
+    update: dict[str, Any] = {"strikes": 0, "script": (), "random": None}
+    if not holding:
+        nobody = dict.fromkeys(
+            ("inertia_kg_m2", "damping_nm_s_per_rad", "stiffness_nm_per_rad"), 0.0
+        )
+        update |= nobody | {"grip": True}
+    hand = settings.simulation.hand.model_copy(update=update)
+    simulation = settings.simulation.model_copy(update={"hand": hand})
+    return settings.model_copy(update={"simulation": simulation})
 
 
 def stiction(measured: Measured, servo: ServoFit) -> Estimate | None:

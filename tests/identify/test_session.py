@@ -11,9 +11,10 @@ import pytest
 from commands import command, config_file
 from rig import eds_with, settings_with
 
+from canwall import config
 from canwall.config import Settings
 from canwall.errors import ConfigError
-from canwall.identify import identify
+from canwall.identify import UntellingDataError, identify
 from canwall.identify.excitation import Bounds, HandExcitation
 from canwall.identify.session import Identification, stiction
 from canwall.record import ROW
@@ -95,12 +96,34 @@ def test_drive_that_is_not_restored_is_a_failure(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_hand_at_the_handle_is_told(tmp_path: Path) -> None:
-    done = command(
-        "identify", config_file(tmp_path / "servo.toml", HELD), "--output", tmp_path / "record"
-    )
-    assert done.returncode == 1
-    (line,) = done.stderr.splitlines()
-    assert "let it go" in line
+    settings = config.load(config_file(tmp_path / "servo.toml", HELD))
+    with pytest.raises(UntellingDataError, match="let it go"):
+        identify(settings, tmp_path / "record")
+
+
+@pytest.mark.slow
+def test_simulated_hand_lets_go_or_holds_still(tmp_path: Path) -> None:
+    """The one of config/sim.toml strikes."""
+    for words, does in (
+        (["identify"], "lets the handle go"),
+        (["identify", "--hand"], "holds the"),
+    ):
+        done = command(*words, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert f"the simulated hand {does}" in done.stderr
+
+
+@pytest.mark.slow
+def test_operator_that_cannot_be_is_refused(tmp_path: Path) -> None:
+    """A hand that strikes instead of holding still."""
+    with pytest.raises(UntellingDataError, match="operator's inertia, which cannot be negative"):
+        identify(settings_with({}), tmp_path / "record", with_hand=True)
+
+
+def test_inertia_of_the_free_handle_is_not_that_of_a_hand() -> None:
+    done = command("identify", "--hand", "--inertia", "1e-4")
+    assert done.returncode == 2
+    assert "leave it out with --hand" in done.stderr
 
 
 @pytest.mark.slow
