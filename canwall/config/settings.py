@@ -22,6 +22,9 @@ from canwall.config.sweep import AxisValues
 #: What the model knows of an ideal drive.
 _IDEAL_DRIVE = {"drive_cycle_s": 0.0, "current_bandwidth_hz": 0.0}
 
+#: Rest between the two parts of the measurement of the delay [cycles].
+_REST_CYCLES = 50
+
 #: Inertia of the heaviest hand: an arm of 0.69 kg at a handle of 80 mm.
 _HEAVIEST_HAND_KG_M2 = 4.4e-3
 
@@ -119,6 +122,12 @@ class Estimator(Section):
     measure_delay: bool | Literal["auto"] = "auto"
     measure_torque_nm: Positive = 0.15
     measure_cycles: int = Field(400, ge=100, le=10_000)
+
+    @property
+    def measurements(self) -> list[slice]:
+        """Cycles of the two parts of the measurement of the delay, with a rest in between."""
+        starts = (0, self.measure_cycles + _REST_CYCLES)
+        return [slice(start, start + self.measure_cycles) for start in starts]
 
 
 class Operator(Section):
@@ -356,6 +365,22 @@ class Settings(Section):
                     f"limits.position_rad = [{low:g}, {high:g}]"
                 )
         return self
+
+    @model_validator(mode="after")
+    def _strike_after_the_measurement(self) -> Self:
+        """Let a simulated hand without first_strike_s rest while the delay may be measured."""
+        simulation, estimator, drive = self.simulation, self.estimator, self.drive
+        if simulation is None or "first_strike_s" in simulation.hand.model_fields_set:
+            return self
+        lags = drive.current_bandwidth_hz == 0.0 and estimator.measure_delay == "auto"
+        unknown = estimator.delay_cycles is None and (drive.torque_pdo == "immediate" or lags)
+        if not (estimator.measure_delay is True or unknown):
+            return self
+        measured_s = estimator.measurements[-1].stop * self.bus.cycle_s
+        update = {"first_strike_s": measured_s + simulation.hand.first_strike_s}
+        hand = simulation.hand.model_copy(update=update)
+        simulation = simulation.model_copy(update={"hand": hand})
+        return self.model_copy(update={"simulation": simulation})
 
     @property
     def stages(self) -> list[Stage]:

@@ -31,8 +31,6 @@ Array = NDArray[np.float64]
 
 #: The torques are random but the same in every run.
 _SEED = 402
-#: Measurements, and rest before each but the first [cycles].
-_REPEATED, _REST = 2, 50
 #: Share of the motion that the model has to explain for a delay to be accepted.
 _EXPLAINED = 0.8
 #: Parts of a measurement whose errors count as independent, and Student's t for 95 %.
@@ -69,9 +67,8 @@ class DelayTest:
         length = min(max(1, math.floor(math.sqrt(farthest / torque))), _LONGEST)
         per_mille = min(torque, farthest) / float(axis.cycle["nm_per_mille"][0])
         amplitude = max(1, math.floor(per_mille))
-        starts = [k * (cycles + _REST) for k in range(_REPEATED)]
-        self._parts = [slice(start, start + cycles) for start in starts]
-        self.cycles = starts[-1] + cycles
+        self._parts = settings.estimator.measurements
+        self.cycles = self._parts[-1].stop
         self._torques = np.zeros(self.cycles, np.int64)
         for k, part in enumerate(self._parts):
             self._torques[part] = amplitude * excitation(cycles, length, _SEED + k)

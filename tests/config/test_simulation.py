@@ -1,9 +1,12 @@
 """`[simulation]`: keys that depend on each other, and what an ideal drive is."""
 
+from pathlib import Path
+
 import pytest
 from pydantic import ValidationError
-from rig import settings_with
+from rig import SIM_CONFIG, settings_with
 
+from canwall import config
 from canwall.config import Hand, Mechanics, Settings, Simulation
 from canwall.simdrive import make_servo
 
@@ -67,3 +70,26 @@ def test_a_shaft_has_two_ends() -> None:
     for rotor, said in ((None, "it is missing"), (2e-4, "not 0.0002")):
         with pytest.raises(ValidationError, match=f"rotor_inertia_kg_m2: with shaft_hz .* {said}"):
             Mechanics(inertia_kg_m2=1e-4, shaft_hz=400.0, rotor_inertia_kg_m2=rotor)
+
+
+def minimal(more: str = "") -> Settings:
+    eds = SIM_CONFIG.parent.parent / "eds/canwall-drive.eds"
+    text = f"""
+        bus.cycle_s = 0.002
+        drive = {{node_id = 5, eds = "{eds}"}}
+        mechanics.inertia_kg_m2 = 1e-4
+        limits.torque_nm = 1.9
+        [simulation]
+        {more}
+    """
+    return config.parse(text, Path("minimal.toml"))
+
+
+@pytest.mark.parametrize(
+    ("more", "first_s"),
+    [("", 1.9), ("ideal = true", 0.2), ("hand.first_strike_s = 0.3", 0.3)],
+)
+def test_first_strike_comes_after_the_measurement_of_the_delay(more: str, first_s: float) -> None:
+    simulation = minimal(more).simulation
+    assert simulation is not None
+    assert simulation.hand.first_strike_s == pytest.approx(first_s)
