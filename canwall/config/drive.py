@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from canwall.config.section import FilePath, NonNegative, Positive, Section
+from canwall.config.section import FilePath, NonNegative, Positive, Section, Torque
 
 _OBJECT = re.compile(r"0x([0-9A-Fa-f]{4})(?::([0-9A-Fa-f]{1,2}))?")
 
@@ -51,10 +51,10 @@ class Drive(Section):
     eds: FilePath
     mode: Literal["auto", "cst", "pt"] = "auto"
     torque_pdo: Literal["sync", "immediate"] = "sync"
-    rated_torque_nm: Positive | None = None
+    rated_torque_nm: Torque | None = None
     rated_torque_unit_nm: Annotated[Positive, Field(ge=1e-9, le=1.0)] | None = None
-    counts_per_rev: Positive | None = None
-    gear_ratio: Positive | None = None
+    counts_per_rev: Annotated[Positive, Field(ge=1.0, le=2.0**32)] | None = None
+    gear_ratio: Annotated[Positive, Field(ge=1e-6, le=1e6)] | None = None
     drive_cycle_s: NonNegative = 0.0
     current_bandwidth_hz: NonNegative = 0.0
     parameters: Objects = Field(default_factory=dict)

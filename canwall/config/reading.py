@@ -10,7 +10,7 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 
 from canwall.config.catalogue import located
-from canwall.config.settings import Settings
+from canwall.config.settings import HANDLE_MAX_M, Settings
 from canwall.errors import ConfigError, did_you_mean
 
 # [wall] may be given in lengths and forces at a handle of radius r instead of angles and torques
@@ -30,7 +30,7 @@ def _convert_metric_keys(raw: dict[str, Any]) -> None:
     """Convert metric keys to angular ones; leave values of a wrong type to the validation."""
     mechanics, schedule = raw.get("mechanics"), raw.get("schedule")
     radius = mechanics.get("handle_radius_m") if isinstance(mechanics, dict) else None
-    if not isinstance(radius, int | float) or not radius > 0:
+    if not isinstance(radius, int | float) or not 0 < radius <= HANDLE_MAX_M:
         return
     changes = schedule if isinstance(schedule, list) else []
     sections = {"wall": raw.get("wall")} | {f"schedule.{i}": c for i, c in enumerate(changes)}

@@ -99,5 +99,12 @@ FilePath = Annotated[Path, BeforeValidator(_path), AfterValidator(_possible)]
 Number = Annotated[float, BeforeValidator(_float)]
 Positive = Annotated[Number, Field(gt=0)]
 NonNegative = Annotated[Number, Field(ge=0)]
+#: Inertia, damping, spring [SI units], torque [N·m], duration [s]: more than any servo has, and few
+#: enough digits for the arithmetic.
+Inertia = Annotated[Positive, Field(ge=1e-9, le=1e3)]
+Damping = Annotated[NonNegative, Field(le=1e3)]
+Stiffness = Annotated[NonNegative, Field(le=1e6)]
+Torque = Annotated[Positive, Field(ge=1e-6, le=1e6)]
+Duration = Annotated[NonNegative, Field(le=3600.0)]
 #: Two numbers, the lower one first.
 Interval = Annotated[Array[tuple[Number, Number]], AfterValidator(_ordered)]

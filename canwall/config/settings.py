@@ -8,11 +8,15 @@ from pydantic import Field, field_validator, model_validator
 from canwall.config.drive import Drive
 from canwall.config.section import (
     Change,
+    Damping,
+    Duration,
+    Inertia,
     Names,
     NonNegative,
     Number,
     Positive,
     Section,
+    Stiffness,
     changed,
     changing,
 )
@@ -25,6 +29,9 @@ _IDEAL_DRIVE = {"drive_cycle_s": 0.0, "current_bandwidth_hz": 0.0}
 #: Rest between the two parts of the measurement of the delay [cycles].
 _REST_CYCLES = 50
 
+#: Largest radius of a handle [m].
+HANDLE_MAX_M = 10.0
+
 #: Inertia of the heaviest hand: an arm of 0.69 kg at a handle of 80 mm.
 _HEAVIEST_HAND_KG_M2 = 4.4e-3
 
@@ -35,7 +42,7 @@ class Bus(Section):
     interface: str = "virtual"
     channel: str = "canwall"
     bitrate: int = Field(1_000_000, gt=0)
-    cycle_s: Annotated[Positive, Field(le=1.0)] = 0.001
+    cycle_s: Annotated[Positive, Field(ge=1e-5, le=1.0)] = 0.001
     pace: Literal["auto", "real_time", "simulated"] = "auto"
     sync: Literal["produce", "external"] = "produce"
     exchange: Literal["auto", "python-can", "native"] = "auto"
@@ -52,11 +59,11 @@ class Mechanics(Section):
         rotor_inertia_kg_m2: With shaft_hz, the rotor's part of inertia_kg_m2.
     """
 
-    inertia_kg_m2: Positive
-    viscous_nm_s_per_rad: NonNegative = 0.0
+    inertia_kg_m2: Inertia
+    viscous_nm_s_per_rad: Damping = 0.0
     coulomb_nm: NonNegative = 0.0
-    spring_nm_per_rad: NonNegative = 0.0
-    handle_radius_m: Positive | None = None
+    spring_nm_per_rad: Stiffness = 0.0
+    handle_radius_m: Annotated[Positive, Field(ge=1e-4, le=HANDLE_MAX_M)] | None = None
     shaft_hz: Annotated[NonNegative, Field(le=1e5)] = 0.0
     shaft_damping_ratio: Annotated[NonNegative, Field(lt=1.0)] = 0.02
     rotor_inertia_kg_m2: Positive | None = None
@@ -87,7 +94,7 @@ class Wall(Section):
     side: Literal["below", "above"] = "below"
     stiffness_nm_per_rad: NonNegative = 50.0
     damping_nm_s_per_rad: NonNegative = 0.0
-    damping_ratio: Positive | None = None
+    damping_ratio: Annotated[Positive, Field(le=100.0)] | None = None
     cap: Positive | None = None
     deadbeat: bool = False
     velocity: Literal["difference", "estimated"] = "difference"
@@ -145,9 +152,9 @@ class Operator(Section):
     """
 
     adapt: bool = True
-    lightest_kg_m2: Positive | None = None
-    heaviest_kg_m2: Positive | None = None
-    damping_nm_s_per_rad: NonNegative = 0.04
+    lightest_kg_m2: Inertia | None = None
+    heaviest_kg_m2: Inertia | None = None
+    damping_nm_s_per_rad: Damping = 0.04
     filters: int = Field(16, ge=3, le=24)
 
 
@@ -203,8 +210,8 @@ class Run(Section):
     """`[run]`: duration, times over which walls fade in and change, format of the bus log."""
 
     duration_s: Positive | None = None
-    ramp_in_s: NonNegative = 0.5
-    blend_s: NonNegative = 0.05
+    ramp_in_s: Duration = 0.5
+    blend_s: Duration = 0.05
     more_laws: Names = ()
     bus_log: Literal["bus.log", "bus.asc", "bus.blf", "bus.csv", "bus.trc", "bus.db"] = "bus.log"
 

@@ -7,7 +7,16 @@ from pydantic import Field, model_validator
 from canwall.config.drive import Objects, by_index
 from canwall.config.fault import Fault
 from canwall.config.hand import Hand
-from canwall.config.section import Array, FilePath, Interval, NonNegative, Number, Positive, Section
+from canwall.config.section import (
+    Array,
+    FilePath,
+    Interval,
+    NonNegative,
+    Number,
+    Positive,
+    Section,
+    Torque,
+)
 
 #: What `ideal = true` stands for, whatever the keys themselves say.
 _IDEAL: dict[str, Any] = {
@@ -63,7 +72,7 @@ class Simulation(Section):
     """
 
     objects: Objects = Field(default_factory=dict)
-    rated_torque_nm: Annotated[Positive, Field(ge=0.001)] = 0.637
+    rated_torque_nm: Annotated[Positive, Field(ge=0.001, le=1e6)] = 0.637
     counts_per_rev: int = Field(131072, gt=0, lt=2**31)
     inertia_kg_m2: Positive = 1.0e-4
     viscous_nm_s_per_rad: NonNegative = 5.0e-4
@@ -81,7 +90,7 @@ class Simulation(Section):
     clock_ppm: Annotated[Number, Field(ge=-1e4, le=1e4)] = 50.0
     clock_phase: Annotated[NonNegative, Field(le=1.0)] = 0.5
     velocity_filter_hz: NonNegative = 200.0
-    peak_torque_nm: Positive | None = None
+    peak_torque_nm: Torque | None = None
     overload_s: NonNegative = 3.0
     dc_link_v: Annotated[Positive, Field(le=1000.0)] = 48.0
     limit_switches_rad: Interval | None = None

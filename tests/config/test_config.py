@@ -202,6 +202,25 @@ REFUSED: list[tuple[dict[str, object], str]] = [
         "schedule.1.position_rad = -9 lies outside limits.position_rad = [-3, 3]",
     ),
     ({"simulation.hand.interval_s": 0.5}, "simulation.hand: a strike lasts 0.7 s"),
+    # what no arithmetic bears
+    *(
+        ({key: value}, f"{key}: has to be {side} than or equal to")
+        for key, value, side in (
+            ("bus.cycle_s", 1e-20, "greater"),
+            ("run.ramp_in_s", 1e17, "less"),
+            ("mechanics.viscous_nm_s_per_rad", 1e20, "less"),
+            ("mechanics.spring_nm_per_rad", 1e20, "less"),
+            ("mechanics.inertia_kg_m2", 1e-300, "greater"),
+            ("operator.heaviest_kg_m2", 1e300, "less"),
+            ("wall.damping_ratio", 1e300, "less"),
+            ("drive.counts_per_rev", 1e300, "less"),
+            ("simulation.peak_torque_nm", 1e300, "less"),
+        )
+    ),
+    (
+        {"mechanics.handle_radius_m": 1e200, "wall.stiffness_n_per_m": 500},
+        "mechanics.handle_radius_m: has to be less than or equal to 10",
+    ),
     # at the handle
     (
         {"wall.stiffness_n_per_m": 500},
