@@ -70,8 +70,9 @@ class Hand(Section):
     """`[simulation.hand]`: a mass, spring and damper about a hand that moves by script.
 
     Without `script` and `random` it makes `strikes` identical strikes, the first one by default
-    0.2 s after the start, or after the delay is measured where the run does so. With `grip` it holds the
-    handle; without, it only presses, from rest_rad towards press_rad, and can lose the handle.
+    0.2 s after the start, or after the delay is measured where the run does so. With `grip` it
+    holds the handle; without, it only presses, from rest_rad towards press_rad, and can lose the
+    handle.
     """
 
     inertia_kg_m2: NonNegative = 6.4e-5

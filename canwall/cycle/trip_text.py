@@ -40,7 +40,9 @@ def trip_text(axis: WallAxis, exchange: Exchange) -> str:
                 f"{_jump_key(axis)} allows"
             )
             if not _missing_recently(axis):
-                what += ": look to the encoder and its cable"
+                simulated = axis.settings.simulation is not None
+                model = "[mechanics] and [simulation]" if simulated else "[mechanics]"
+                what += f": look to the encoder and its cable, and to {model}"
         case Trip.STUCK:
             what = (
                 f"the position has not changed for {int(cycle['frozen'])} cycles, in which the "

@@ -39,7 +39,7 @@ def test_pause_that_the_watchdog_may_have_met(
 def test_trip_after_missing_tpdos_names_them(make_rig: RigFactory, trip: Trip) -> None:
     loop = Loop(make_rig(settings_with()))
     loop.record["trip"] = trip
-    encoder = "look to the encoder and its cable"
+    encoder = "look to the encoder and its cable, and to [mechanics] and [simulation]"
     without = trip_text(loop.axis, loop.exchange)
     assert ("TPDO" in without, encoder in without) == (False, trip is Trip.JUMP)
     loop.record["missed_recently"] = 0b1011
