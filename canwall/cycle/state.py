@@ -240,12 +240,14 @@ def modelled_delay(settings: Settings) -> float:
     lag_s = 0.0
     if drive.current_bandwidth_hz:
         lag_s = 1.0 / (2.0 * math.pi * drive.current_bandwidth_hz)
-    bus = SYNCHRONOUS_DELAY if delay is None else delay
-    delay = bus + (drive.drive_cycle_s + lag_s) / settings.bus.cycle_s
+    bus, period = SYNCHRONOUS_DELAY if delay is None else delay, settings.bus.cycle_s
+    delay = bus + (drive.drive_cycle_s + lag_s) / period
     if delay > MAX_DELAY:
         raise ConfigError(
-            f"bus.cycle_s: with drive.drive_cycle_s and drive.current_bandwidth_hz a torque acts "
-            f"{delay:.3g} cycles after its sample, {MAX_DELAY} at most: has to be longer"
+            f"a torque acts {delay:.3g} cycles after its sample, {MAX_DELAY} at most: {bus:.3g} of "
+            f"estimator.delay_cycles, {drive.drive_cycle_s / period:.3g} of drive.drive_cycle_s, "
+            f"{lag_s / period:.3g} of drive.current_bandwidth_hz; correct what is wrong of them, "
+            f"or give a longer bus.cycle_s"
         )
     return delay
 
