@@ -50,6 +50,15 @@ def _convert_metric_keys(raw: dict[str, Any]) -> None:
             section[angular] = value * float(radius) ** exponent
 
 
+def _check_damping(raw: dict[str, Any]) -> None:
+    """Raise ConfigError for a `[wall]` with a damping and a damping ratio, which overrules it."""
+    wall = raw.get("wall")
+    if isinstance(wall, dict) and wall.get("damping_ratio") and wall.get("damping_nm_s_per_rad"):
+        raise ConfigError(
+            "wall.damping_ratio: damping_nm_s_per_rad is given as well; keep one of them"
+        )
+
+
 def load(path: Path, overrides: Mapping[str, Any] | None = None) -> Settings:
     """Read and validate a TOML file.
 
@@ -82,6 +91,7 @@ def parse(text: str, path: Path, overrides: Mapping[str, Any] | None = None) -> 
     try:
         check_values(raw)
         _convert_metric_keys(raw)
+        _check_damping(raw)
         for dotted, value in (overrides or {}).items():
             section, key = dotted.split(".")
             table = raw.setdefault(section, {})

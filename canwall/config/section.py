@@ -101,7 +101,7 @@ Positive = Annotated[Number, Field(gt=0)]
 NonNegative = Annotated[Number, Field(ge=0)]
 #: Inertia, damping, spring [SI units], torque [N·m], duration [s]: more than any servo has, and few
 #: enough digits for the arithmetic.
-Inertia = Annotated[Positive, Field(ge=1e-9, le=1e3)]
+Inertia = Annotated[Positive, Field(ge=1e-9, le=1e6)]
 Damping = Annotated[NonNegative, Field(le=1e3)]
 Stiffness = Annotated[NonNegative, Field(le=1e6)]
 Torque = Annotated[Positive, Field(ge=1e-6, le=1e6)]

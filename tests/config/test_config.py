@@ -202,6 +202,10 @@ REFUSED: list[tuple[dict[str, object], str]] = [
         "schedule.1.position_rad = -9 lies outside limits.position_rad = [-3, 3]",
     ),
     ({"simulation.hand.interval_s": 0.5}, "simulation.hand: a strike lasts 0.7 s"),
+    (
+        {"wall.damping_ratio": 0.5, "wall.damping_nm_s_per_rad": 0.1},
+        "wall.damping_ratio: damping_nm_s_per_rad is given as well; keep one of them",
+    ),
     # what no arithmetic bears
     *(
         ({key: value}, f"{key}: has to be {side} than or equal to")
