@@ -59,6 +59,10 @@ def adapter_reports(bus: BusSettings) -> list[AdapterReport]:
             command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=True
         )
         (link,) = json.loads(shown.stdout)
+    except subprocess.CalledProcessError as error:
+        why = error.stderr.strip() or f"exit code {error.returncode}"
+        do = f"look to bus.channel = {bus.channel!r}; `ip link` lists what there is"
+        return [AdapterReport("adapter", f"`{' '.join(command)}` does not tell: {why}", do)]
     except (OSError, ValueError, subprocess.SubprocessError) as error:
         return [
             AdapterReport(

@@ -17,6 +17,7 @@ from canwall.cli.options import (
     JsonOption,
     NoWatchdogOption,
     absolute_path,
+    refuse_to_overwrite,
     settings_from,
 )
 from canwall.cli.output import ProgressDisplay, console, errors, print_json, say
@@ -80,6 +81,7 @@ def dbc(
     The drives are set up as for a run, but not enabled, and put back.
     """
     need("dbc")
+    refuse_to_overwrite(output)
     many = [settings_from(path) for path in config_files]
     from canwall.bench.dbc import dbc_text, mapped_drive
     from canwall.drive import REQUIRED_OBJECTS

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from canwall.cli.completion import complete_config, complete_law
+from canwall.errors import InputError
 
 if TYPE_CHECKING:
     from canwall.config import Settings
@@ -53,6 +54,12 @@ def settings_from(path: Path | None, **overrides: Any) -> "Settings":
         key.replace("__", "."): value for key, value in overrides.items() if value is not None
     }
     return config.load(path or config.shipped("config/sim.toml"), dotted)
+
+
+def refuse_to_overwrite(output: Path) -> None:
+    """Raise InputError for a file that exists."""
+    if output.is_file():
+        raise InputError(f"{output}: exists already; choose another --output")
 
 
 def absolute_path(path: Path | None) -> Path | None:

@@ -264,9 +264,8 @@ def _strike_table(strikes: list[dict[str, Any]]) -> Table:
     from canwall.config import short_law
 
     finds = any(_is_found(strike) for strike in strikes)
-    table = Table(
-        title="Strikes", title_justify="left", box=box.SIMPLE, padding=0, show_edge=not finds
-    )
+    title = "Strikes, K in N·m/rad" if finds else "Strikes"
+    table = Table(title=title, title_justify="left", box=box.SIMPLE, padding=0, show_edge=not finds)
     headings = [
         "#",
         "law",

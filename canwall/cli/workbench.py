@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from canwall.cli.completion import complete_law
-from canwall.cli.options import JsonOption
+from canwall.cli.options import JsonOption, refuse_to_overwrite
 from canwall.cli.output import ProgressDisplay, console, print_json
 from canwall.errors import InputError
 from canwall.extras import need
@@ -38,6 +38,7 @@ def ball(
     as_json: JsonOption = False,
 ) -> int:
     """Simulate a ball that bounces on the wall as its floor: exact state, no delay, held force."""
+    refuse_to_overwrite(output)
     from canwall.config import absolute_law
     from canwall.workbench import CONTINUOUS, Ball, simulate_ball, write_ball
 
@@ -77,9 +78,9 @@ def ball(
         return 0
     end = "never outside"
     if last is not None:
-        end = f"{energy[last]:.9g} at the last sample outside (t = {last * period:g})"
+        end = f"{energy[last]:.9g} J at the last sample outside (t = {last * period:g} s)"
     console.print(
-        f"θ = {ball.theta:g}; energy {energy[0]:.9g} at the start, {end}",
+        f"θ = {ball.theta:g}; energy {energy[0]:.9g} J at the start, {end}",
         highlight=False,
         soft_wrap=True,
     )

@@ -341,6 +341,8 @@ def _parse_change(assignments: Sequence[str]) -> Request:
             table = table.setdefault(part, {})
             if not isinstance(table, dict):
                 raise ConfigError(f"{key.strip()}: {part} has a value of its own; keep one of them")
+        if name in table:
+            raise ConfigError(f"{key.strip()}: is given twice; keep one of them")
         table[name] = _parse_value(value)
     return parse_request(values)
 

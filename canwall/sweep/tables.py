@@ -11,7 +11,7 @@ from rich.table import Table
 
 from canwall.config import short_law
 from canwall.sweep.axes import DAMPING, STIFFNESS, STRIKES
-from canwall.sweep.labels import axis_name
+from canwall.sweep.labels import LABELS, axis_name
 
 
 def sweep_table(dataset: xr.Dataset) -> Table:
@@ -64,7 +64,7 @@ def _limit_rows(dataset: xr.Dataset) -> Iterator[dict[str, str]]:
             "K\n[N·m/rad]": at_least + f"{limit:.3g}",
             "K·T²/m": at_least + f"{normalised:.3g}",
             **(
-                {"K in\nforce": _least(dataset["stiffness_in_force"].isel(index))}
+                {"K in force\n[N·m/rad]": _least(dataset["stiffness_in_force"].isel(index))}
                 if lowered
                 else {}
             ),
@@ -110,7 +110,7 @@ def _map_rows(dataset: xr.Dataset) -> Iterator[dict[str, str]]:
         yield labels | {
             "walls": str(map_chatters.size),
             "free": str(int((~map_chatters).sum())),
-            f"free up to\n{wall[1]}": f"{stiffness[free - 1]:.3g}" if free else "none",
+            f"free up to\n{LABELS[wall[1]]}": f"{stiffness[free - 1]:.3g}" if free else "none",
             **({"K in force\n÷ asked": _least(share.isel(index))} if lowered else {}),
             "energy out\n[mJ], at most": f"{energy_out * 1e3:.3g}",
         }

@@ -1,5 +1,6 @@
 """What an adapter tells of itself, as `ip -details -statistics -json link` of iproute2 has it."""
 
+import subprocess
 from typing import Any
 
 import pytest
@@ -91,3 +92,13 @@ def test_other_interfaces(interface: str, words: str) -> None:
 def test_an_interface_that_is_not_there() -> None:
     (report,) = adapter_reports(Bus(interface="socketcan", channel="can-none"))
     assert "does not tell" in report.found
+
+
+def test_an_interface_that_ip_does_not_know(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(command: list[str], **options: object) -> None:
+        raise subprocess.CalledProcessError(1, command, "", 'Device "can-none" does not exist.\n')
+
+    monkeypatch.setattr(subprocess, "run", fail)
+    (report,) = adapter_reports(Bus(interface="socketcan", channel="can-none"))
+    assert report.found.endswith('does not tell: Device "can-none" does not exist.')
+    assert "bus.channel = 'can-none'" in report.do

@@ -36,6 +36,8 @@ class Bounce:
         self._capfd, self._monkeypatch = capfd, monkeypatch
 
     def __call__(self, *arguments: object) -> Said:
+        if self.file.is_file():
+            self.file.unlink()
         words = ("canwall", "ball", "--output", self.file, *arguments)
         self._monkeypatch.setattr(sys, "argv", [str(word) for word in words])
         with pytest.raises(SystemExit) as ended:
@@ -78,7 +80,7 @@ def end_over_start(columns: Array) -> float:
 def test_energy_is_kept(bounce: Bounce, law: tuple[str, ...], theta: float) -> None:
     said = bounce("--law", *law, "--stiffness", (theta / 0.1) ** 2)
     assert (said.code, said.err) == (0, "")
-    assert said.out.startswith(f"θ = {theta:g}; energy 1 at the start, 1 at the last sample")
+    assert said.out.startswith(f"θ = {theta:g}; energy 1 J at the start, 1 J at the last sample")
     assert end_over_start(bounce.columns()) == pytest.approx(1.0, rel=0.0, abs=1e-9)
 
 
@@ -86,7 +88,7 @@ def test_energy_is_kept(bounce: Bounce, law: tuple[str, ...], theta: float) -> N
 def test_energy_that_is_not_kept(bounce: Bounce, law: str, end: float) -> None:
     said = bounce("--law", law)
     assert end_over_start(bounce.columns()) == pytest.approx(end, rel=1e-5)
-    assert f"energy 1 at the start, {end:.4f}" in said.out
+    assert f"energy 1 J at the start, {end:.4f}" in said.out
 
 
 def test_every_option_reaches_the_ball(bounce: Bounce) -> None:
@@ -200,3 +202,12 @@ def test_one_line_for_a_law_that_cannot_be_compiled(bounce: Bounce, tmp_path: Pa
     assert (said.code, said.out) == (2, "")
     (line,) = said.err.splitlines()
     assert line.startswith(f"canwall: {tmp_path}/mine.py:mine: does not compile: ")
+
+
+def test_file_that_exists_is_kept(tmp_path: Path) -> None:
+    file = tmp_path / "ball.csv"
+    file.write_text("mine")
+    done = command("ball", "--law", "midpoint", "--output", file)
+    assert done.returncode == 2
+    assert done.stderr.endswith("ball.csv: exists already; choose another --output\n")
+    assert file.read_text() == "mine"
