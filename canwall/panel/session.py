@@ -69,6 +69,7 @@ class Session:
         self._follower = Follower(folder, self, open_live)
         self._requests = ThreadPoolExecutor(1, "requests")
         self._starts = ThreadPoolExecutor(1, "starts")
+        self._start_lock = asyncio.Lock()
         self._waiting = 0
         self._presets = Presets()
         self._run: Attached | None = None
@@ -180,13 +181,14 @@ class Session:
 
     async def start(self, request: Start) -> dict[str, Any]:
         """Start a run. Raises ConfigError if it cannot be."""
-        if self._run is not None or self._is_starting:
-            raise ConfigError("a run is in progress; end it first")
-        loop = asyncio.get_running_loop()
-        self._starting = started = await loop.run_in_executor(
-            self._starts, self.launcher.start, request
-        )
-        self._follower.expect(started)
+        async with self._start_lock:
+            if self._run is not None or self._is_starting:
+                raise ConfigError("a run is in progress; end it first")
+            loop = asyncio.get_running_loop()
+            self._starting = started = await loop.run_in_executor(
+                self._starts, self.launcher.start, request
+            )
+            self._follower.expect(started)
         self.pages.tell(
             "run", state="starting", name=started.folder.name, folder=str(started.folder), text=""
         )

@@ -22,7 +22,8 @@ from websockets.sync.client import ClientConnection, connect
 from canwall.analysis import metrics
 from canwall.panel import follower, session
 from canwall.panel import server as panel_server
-from canwall.panel.launch import StartedRun
+from canwall.panel.launch import Launcher, StartedRun
+from canwall.panel.messages import Start
 from canwall.panel.pages import MOST_PAGES, Outbox
 
 PATIENCE_S = 30.0
@@ -292,6 +293,30 @@ def test_stop_of_a_run_that_has_not_begun(
         beside.session._starting = StartedRun(beside.folder, process, beside.folder / "output.txt")
         assert page.ask("stop") == {"answer": 2, "ok": True, "confirmed": False}
         assert process.wait(PATIENCE_S) == -signal.SIGINT
+
+
+def test_two_starts_at_once_start_one_run(
+    beside: PanelBeside, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs = []
+    with subprocess.Popen(["sleep", "60"]) as process:
+
+        def start(self: Launcher, request: Start) -> StartedRun:
+            time.sleep(0.2)
+            runs.append(StartedRun(beside.folder, process, beside.folder / "output.txt"))
+            return runs[-1]
+
+        async def both() -> list[Any]:
+            starts = [beside.session.start(Start()) for _ in range(2)]
+            return await asyncio.gather(*starts, return_exceptions=True)
+
+        monkeypatch.setattr(Launcher, "start", start)
+        loop = beside.session._loop
+        assert loop is not None
+        _, refused = asyncio.run_coroutine_threadsafe(both(), loop).result(PATIENCE_S)
+        process.kill()
+    assert str(refused) == "a run is in progress; end it first"
+    assert len(runs) == 1
 
 
 def test_control(page: PageOf, run: FakeRun, open_page: Callable[[], PageOf]) -> None:
