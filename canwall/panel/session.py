@@ -225,9 +225,16 @@ class Session:
         self._run.live.beat()
         if self._dead_man_s and not self._watches_beat:
             self._watches_beat = True
-            watch = {"do": "watch_beat", "timeout_s": self._dead_man_s}
-            self._submit(partial(self._run.live.request, watch))
+            self._submit(partial(self._watch_beat, self._run))
         return {"ok": True}
+
+    def _watch_beat(self, run: Attached) -> None:
+        """Have a run watch for beats; the next beat tries again what fails."""
+        try:
+            run.live.request({"do": "watch_beat", "timeout_s": self._dead_man_s})
+        except (InputError, RunFailedError):
+            self._watches_beat = False
+            raise
 
     async def _in_turn(self, do: str, content: Any) -> dict[str, Any]:
         if do == "start":

@@ -347,6 +347,19 @@ def test_beat_of_the_page_in_control(tmp_path: Path) -> None:
         assert run.requests == [{"do": "watch_beat", "timeout_s": 0.5}]
 
 
+def test_watch_of_the_beat_that_fails_is_tried_again(tmp_path: Path) -> None:
+    with PanelBeside(tmp_path, dead_man_s=0.5) as beside, PageOf.opened(beside) as page:
+        run = beside.begin_run()
+        page.event("status")
+        run.refusal = "the run does not answer"
+        assert page.ask("beat")["ok"]
+        page.event("problem", text="the run does not answer")
+        run.refusal = None
+        assert page.ask("beat")["ok"]
+        wait_until(lambda: run.requests, 2.0)
+        assert run.requests == [{"do": "watch_beat", "timeout_s": 0.5}]
+
+
 def test_run_that_ends_and_the_next_one(
     page: PageOf, run: FakeRun, beside: PanelBeside, open_page: Callable[[], PageOf]
 ) -> None:
