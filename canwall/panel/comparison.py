@@ -82,6 +82,9 @@ class Comparison:
             self._procedure, self._found, self._answered = procedure, {}, 0
             try:
                 self._note({"blind": procedure.name, "seed": self._seed})
+                # No other law takes its turn within a trial.
+                one = {"law": wall.law, "options": wall.options}
+                self._request({"do": "take_turns", "walls": [one]})
                 self._present()
             except BaseException:
                 self._finish("it could not begin")

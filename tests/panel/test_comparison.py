@@ -147,6 +147,17 @@ def test_a_person_who_feels_everything(tmp_path: Path) -> None:
     assert [row["chosen"] for row in table] == ["0", "0", "6", "6"]
 
 
+def test_no_other_law_takes_its_turn_in_a_comparison() -> None:
+    run = Run()
+    comparison(run)
+    turns, change = run.requests
+    assert turns == {
+        "do": "take_turns",
+        "walls": [{"law": IN_FORCE.law, "options": IN_FORCE.options}],
+    }
+    assert change["do"] == "change"
+
+
 def test_a_person_who_guesses_has_a_function(tmp_path: Path) -> None:
     run, random = Run(), np.random.default_rng(3)
     made = comparison(run, tmp_path, repeats=50, factors=[0.6, 0.8, 1.25, 1.6])
