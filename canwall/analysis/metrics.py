@@ -105,12 +105,13 @@ class Chatter:
     Attributes:
         chatters: True if the wall chattered.
         reason: The reason in words.
-        by: The criterion that found chatter, the first of several; empty without chatter.
+        by: The criterion that found chatter, the first of several; empty without chatter. "limits":
+            the handle was thrown beyond limits that the referent keeps.
     """
 
     chatters: bool
     reason: str
-    by: Literal["", "counts", "amplitude", "ripple"] = ""
+    by: Literal["", "counts", "amplitude", "ripple", "limits"] = ""
 
 
 @dataclass(frozen=True)

@@ -173,6 +173,23 @@ def measure_strike(
 
 
 @compiled
+def keeps_limits(
+    referent: Array, position: tuple[float, float], speed: float, period: float
+) -> bool:
+    """Return True if the referent keeps the limits of position and speed on the drive's axis.
+
+    A soft wall may give way that far, and a stiff one return that much of the energy put into it.
+    """
+    low, high = position
+    for j in range(len(referent)):
+        if not low <= referent[j] <= high:
+            return False
+        if j and not abs(referent[j] - referent[j - 1]) / period <= speed:
+            return False
+    return True
+
+
+@compiled
 def _touches(y: float, force: float) -> bool:
     """Return True in contact, as `metrics.contacts` defines it."""
     return y < 0.0 or force != 0.0

@@ -30,6 +30,7 @@ def summarise(
     units: DriveUnits,
     referent: Array | None,
     referent_felt: Array | None,
+    thrown: bool = False,
 ) -> dict[str, Any]:
     """Return energy, contacts and chatter of a run.
 
@@ -40,6 +41,7 @@ def summarise(
         referent: Positions at the continuous wall at the same SYNCs, shape (n,); None if a person
             was at the handle.
         referent_felt: Mean forces on the hand there [N·m], shape (n,), or None.
+        thrown: True if the wall threw the handle beyond limits that the referent keeps.
     """
     y, force = numbers(signals, "y"), numbers(signals, "force_applied")
     stiffness, laws = numbers(signals, "stiffness"), signals["law"]
@@ -48,10 +50,12 @@ def summarise(
     touched = metrics.contacts(np.where(rendering, y, np.inf), force)
     names = ("stiffness_in_force", "mass_est", "mass_spread", "delay_est")
     in_force = {name: numbers(signals, name) for name in names}
+    found = metrics.strikes(touched, settings.bus.cycle_s, _changes(signals))
+    on_the_way = (y, force, work, stiffness, laws, settings, units, referent, referent_felt)
     strikes = [
-        _strike(strike, y, force, work, stiffness, laws, settings, units, referent, referent_felt)
+        _strike(strike, *on_the_way, thrown=thrown and strike is found[-1])
         | _in_force(strike, y, force, in_force)
-        for strike in metrics.strikes(touched, settings.bus.cycle_s, _changes(signals))
+        for strike in found
     ]
     chattering = [s for s in strikes if s["chatter"]]
     torque = numbers(signals, "torque_cmd")
@@ -95,6 +99,7 @@ def _strike(
     units: DriveUnits,
     referent: Array | None,
     referent_felt: Array | None,
+    thrown: bool,
 ) -> dict[str, Any]:
     cycles, start = strike.cycles, strike.cycles.start
     period = settings.bus.cycle_s
@@ -122,6 +127,8 @@ def _strike(
         bool(running.max() > energy_tolerance),
         ripple,
     )
+    if thrown:
+        verdict = metrics.Chatter(True, "it threw the handle beyond the limits", "limits")
     amplitude, frequency = metrics.limit_cycle(inside, period) if verdict.chatters else (0.0, 0.0)
     if verdict.by == "ripple":  # it may be felt within one count
         _, frequency = metrics.limit_cycle(force[judged], period)

@@ -5,9 +5,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from canwall.analysis import AskedWall
-from canwall.config import ConfigError, Settings
-from canwall.cycle import BusMonitor, Exchange, Outcome, WallAxis, timing_summary
+from canwall.analysis import AskedWall, metrics
+from canwall.analysis.strike import keeps_limits
+from canwall.config import ConfigError, Limits, Settings
+from canwall.cycle import BusMonitor, Exchange, Outcome, Trip, WallAxis, timing_summary
 from canwall.drive import DriveSetup
 from canwall.errors import RunFailedError
 from canwall.record import Phase, RecordError, RunFolder, numbers, read_signals
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 _LATE_CYCLES = 0.5
 #: Cycles before the end in which the delay is looked for.
 _LATEST = 200_000
+#: Trips of a wall that throws the handle; the others are those of a fault.
+_OF_LIMITS = (Trip.SPEED, Trip.POSITION, Trip.ENERGY)
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,8 @@ def write_result(
     settings, machine = axis.settings, outcome.machine
     notes = [note for note in notes if note not in outcome.trips]  # each is told once
     signals = _read_recorded(folder, [*outcome.trips, *notes])
-    summary = judged(signals, settings, axis.setup.units)
+    exceeded = int(axis.cycle["trip"][0]) in _OF_LIMITS
+    summary = judged(signals, settings, axis.setup.units, axis.limits if exceeded else None)
     summary |= {
         "cut_off": False,
         "missed_tpdo": int(axis.cycle["missed_tpdo"][0]),
@@ -109,14 +113,37 @@ def write_result(
     )
 
 
-def judged(signals: "pa.Table", settings: Settings, units: DriveUnits) -> dict[str, Any]:
-    """Return what the summary has from the rows, judged against the continuous referent."""
-    asked = AskedWall(*(numbers(signals, name) for name in AskedWall._fields))
+def judged(
+    signals: "pa.Table", settings: Settings, units: DriveUnits, exceeded: Limits | None = None
+) -> dict[str, Any]:
+    """Return what the summary has from the rows, judged against the continuous referent.
+
+    Args:
+        signals: Record of the run, one row per cycle.
+        settings: Configuration of the run.
+        units: Scales of the drive.
+        exceeded: The limits in force, if the handle exceeded one of them and that ended the run.
+    """
+    # A referent that exceeds them somewhat later exceeds them.
+    more = (0, metrics.event_window(settings.bus.cycle_s) if exceeded else 0)
+    asked = AskedWall(*(np.pad(numbers(signals, n), more, "edge") for n in AskedWall._fields))
+    wall_position = np.pad(numbers(signals, "wall_position_rad"), more, "edge")
     # When the wall begins it has been measured, if it is to be, and nothing has been found yet.
     begin = int(np.argmax(numbers(signals, "phase") == Phase.RENDERING))
     told = float(numbers(signals, "delay_est")[begin])
-    referent = referent_motion(settings, asked, numbers(signals, "wall_position_rad"), told)
-    found = summarise(signals, settings, units, *((None, None) if referent is None else referent))
+    referent = referent_motion(settings, asked, wall_position, told)
+    if referent is None:
+        found = summarise(signals, settings, units, None, None)
+    else:
+        side = 1.0 if settings.wall.side == "below" else -1.0
+        thrown = exceeded is not None and keeps_limits(
+            wall_position + side * referent.y,
+            exceeded.position_rad,
+            exceeded.speed_rad_s,
+            settings.bus.cycle_s,
+        )
+        y, felt = (values[: signals.num_rows] for values in referent)
+        found = summarise(signals, settings, units, y, felt, thrown)
     return found | {"motion_delay_cycles": _delay_of(signals)}
 
 

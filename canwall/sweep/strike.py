@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from canwall.analysis import AskedWall, ReferentInputs, follow_referent
 from canwall.analysis.felt import HANDLE_RADIUS_M, FeltBand, felt_band, handle_radius
-from canwall.analysis.strike import MEASURES, measure_strike
+from canwall.analysis.strike import MEASURES, keeps_limits, measure_strike
 from canwall.compiled import Record, compiled
 from canwall.config import ConfigError, Hand, Mechanics, Settings, Simulation
 from canwall.cycle import named_law, run_laws, stiffest_for
@@ -477,7 +477,13 @@ def _judge(
         signals[1],
         signals[2],
         trip,
-        trip != 0 and not _exceeds_limits(cycle, referent),
+        trip != 0
+        and keeps_limits(
+            cycle.rendered[0].position + cycle.orientation * referent,
+            (cycle.position_low, cycle.position_high),
+            cycle.speed_limit,
+            cycle.period,
+        ),
         signals[3],
         signals[4:],
         referent[rendered],
@@ -490,21 +496,6 @@ def _judge(
         stiffness,
         measures,
     )
-
-
-@compiled
-def _exceeds_limits(cycle: Record, referent: Array) -> bool:
-    """Return whether the referent itself exceeds the limits of position or speed.
-
-    A soft wall may give way that far, and a stiff one return that much of the energy put into it.
-    """
-    for j in range(len(referent)):
-        position = cycle.rendered[0].position + cycle.orientation * referent[j]
-        if not cycle.position_low <= position <= cycle.position_high:
-            return True
-        if j and not abs(referent[j] - referent[j - 1]) / cycle.period <= cycle.speed_limit:
-            return True
-    return False
 
 
 def signals_over_bus(settings: Settings) -> tuple[Array, int]:

@@ -21,6 +21,7 @@ from canwall.record.pictures import draw_run
 from canwall.run.closed_loop import SIGNALS, ClosedLoop, simulate, simulate_loop
 from canwall.run.result import judged
 from canwall.sweep.axes import settings_at
+from canwall.sweep.strike import PreparedStrike
 
 
 def strike(operator: str, stiffness: float) -> tuple[pa.Table, Settings, Any, float]:
@@ -140,3 +141,30 @@ def test_picture_has_mass_and_stiffness_in_force(
     assert np.array_equal(np.asarray(in_force), table["stiffness_in_force"].to_numpy())
     (mass,) = axes["mass [g·m²]"].lines
     assert np.array_equal(np.asarray(mass.get_ydata()), 1e3 * table["mass_est"].to_numpy())
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "limits", "thrown"),
+    [
+        (1000.0, {"limits.speed_rad_s": 5.0}, True),
+        # The referent gives way as far.
+        (5.0, {"limits.position_rad": [-0.01, 1.0]}, False),
+    ],
+)
+def test_a_wall_that_throws_the_handle_chatters_as_in_a_sweep(
+    stiffness: float, limits: dict[str, Any], thrown: bool
+) -> None:
+    base = settings_with({"wall.law": "standard", "wall.stiffness_nm_per_rad": stiffness, **limits})
+    axes = {"operator": "fingertip", "speed": 1.0, "phase": 0.0, "servo": "ideal"}
+    settings = settings_at(base, axes)
+    assert settings.run.duration_s is not None
+    found = simulate(settings, round(settings.run.duration_s / settings.bus.cycle_s))
+    assert found.trip
+    table = pa.Table.from_batches([record_batch(found.rows, ["standard"])])
+    (judgement,) = judged(table, settings, found.units, settings.limits)["strikes"]
+    measures = PreparedStrike(settings).on(stiffness, settings.wall.damping_nm_s_per_rad)
+    assert judgement["chatter"] == measures["chatters"] == thrown
+    assert judgement["chatter_by"] == ("limits" if thrown else "")
+    assert judgement["chatter_amplitude_rad"] == measures["amplitude"]
+    (judgement,) = judged(table, settings, found.units)["strikes"]
+    assert not judgement["chatter"]  # ended by something else
