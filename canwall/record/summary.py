@@ -129,7 +129,10 @@ def _strike(
     )
     if thrown:
         verdict = metrics.Chatter(True, "it threw the handle beyond the limits", "limits")
-    amplitude, frequency = metrics.limit_cycle(inside, period) if verdict.chatters else (0.0, 0.0)
+    amplitude = frequency = 0.0
+    if verdict.chatters:
+        settles = referent is not None and judged.stop > judged.start
+        amplitude, frequency = metrics.limit_cycle(y[judged] if settles else inside, period)
     if verdict.by == "ripple":  # it may be felt within one count
         _, frequency = metrics.limit_cycle(force[judged], period)
     around = slice(max(start - 2 * SPAN, 0), cycles.stop + SPAN)
