@@ -1,6 +1,7 @@
 """Result of a sweep as an xarray Dataset with everything its figures need, and its NetCDF file."""
 
 import functools
+import hashlib
 import importlib.metadata
 import json
 import platform
@@ -57,9 +58,18 @@ def plan_json(plan: Plan) -> str:
             "axes": [[axis.name, *axis.values] for axis in plan.axes],
             "through": plan.through,
             "configuration": plan.base.to_toml(),
+            "files": _digests(plan),
             "versions": versions(),
         }
     )
+
+
+def _digests(plan: Plan) -> dict[str, str]:
+    """Return the digests of the files that plan and configuration name: laws and dictionary."""
+    named = [str(plan.base.drive.eds), plan.base.wall.law]
+    named += [value for axis in plan.axes for value in axis.values if isinstance(value, str)]
+    files = {path for name in named if (path := Path(name.rpartition(":")[0] or name)).is_file()}
+    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(files)}
 
 
 def assemble_dataset(plan: Plan, pieces: Mapping[int, NDArray[np.void]]) -> xr.Dataset:

@@ -25,6 +25,7 @@ from canwall.analysis.k_limit import FINE_FACTOR
 from canwall.errors import InputError
 from canwall.sweep import Plan, ineffective_axis_notes, make_plan, read_sweep, sweep, sweep_table
 from canwall.sweep.axes import settings_at
+from canwall.sweep.dataset import plan_json
 from canwall.sweep.journal import Journal
 from canwall.sweep.plan import compute_piece
 from canwall.sweep.workers import compute_pieces
@@ -216,6 +217,25 @@ def test_an_interrupted_sweep_goes_on(tmp_path: Path) -> None:
     assert resumed.identical(whole)
     assert read_sweep(output).identical(whole)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["parts.nc", "whole.nc"]
+
+
+def test_a_plan_is_another_one_with_other_contents_of_its_files(tmp_path: Path) -> None:
+    law, eds = tmp_path / "law.py", tmp_path / "drive.eds"
+    text = "def force(wall):\n    return -wall.stiffness * wall.y\n"
+    law.write_text(text)
+    base = settings_with()
+    eds.write_bytes(base.drive.eds.read_bytes())
+    base = base.model_copy(update={"drive": base.drive.model_copy(update={"eds": eds})})
+    plan = make_plan(base, {**SMALL, "law": [f"{law}:force"], "stiffness": [1.0]})
+    known = [plan_json(plan)]
+    law.write_text(f"{text}# another one\n")
+    known.append(plan_json(plan))
+    eds.write_bytes(eds.read_bytes() + b"\n")
+    known.append(plan_json(plan))
+    law.write_text(text)
+    known.append(plan_json(plan))
+    assert len(set(known)) == 4
+    assert plan_json(plan) == known[-1]
 
 
 def test_a_file_that_is_no_journal_is_left_alone(tmp_path: Path) -> None:
