@@ -263,7 +263,9 @@ def first_bounce(y: Array, period: float, count: float) -> tuple[float, float]:
 
     Speeds are means over SPAN samples. That of the approach is the fastest of those which end
     within the last SPAN samples before the contact, since a wall may act ahead of its surface; that
-    on leaving is over the first samples outside, and negative of a handle that turns back in these.
+    on leaving is over the first samples outside, and negative of a handle that turns back in these;
+    of one that is inside again by then, it is that from the last sample inside to the farthest one,
+    less a count.
     Where a wall has stopped the handle before its surface, it creeps in: below a count a sample its
     speed says nothing, and the restitution is the speed on leaving over a count a sample.
     """
@@ -278,10 +280,17 @@ def first_bounce(y: Array, period: float, count: float) -> tuple[float, float]:
     leave = enter
     while leave < len(y) and y[leave] < 0.0:
         leave += 1
-    if leave + SPAN >= len(y) or not speed < 0.0:
+    if not speed < 0.0:
         return speed, math.nan
-    for j in range(leave, leave + SPAN):
-        if y[j] < 0.0:
-            return speed, math.nan
-    out = (y[leave + SPAN] - y[leave]) / (SPAN * period)
+    back = leave
+    while back < len(y) and back <= leave + SPAN and y[back] >= 0.0:
+        back += 1
+    if back > leave + SPAN:
+        out = (y[leave + SPAN] - y[leave]) / (SPAN * period)
+    elif back == len(y):
+        return speed, math.nan
+    else:
+        farthest = leave + np.argmax(y[leave:back])
+        # That quantisation makes a rise longer by up to a count shall not make it faster.
+        out = max(y[farthest] - y[leave - 1] - count, 0.0) / ((farthest - leave + 1) * period)
     return speed, out / max(-speed, count / period)

@@ -39,6 +39,27 @@ def test_speed_of_a_handle_that_creeps_in_is_a_count_a_sample() -> None:
         assert found == pytest.approx(out)
 
 
+@pytest.mark.parametrize(
+    ("outside", "out"),
+    [
+        ([1.0], (2.5 - 0.25) / 1.0),
+        ([1.0, 3.0, 2.0], (4.5 - 0.25) / 2.0),
+        ([1.0, 1.5, 2.0, 2.5, 2.0], (4.0 - 0.25) / 4.0),  # inside again at the last sample
+    ],
+)
+def test_a_handle_that_comes_back_at_once_leaves_at_its_rise(
+    outside: list[float], out: float
+) -> None:
+    y = np.array([*np.arange(20.0, -1.0, -1.0), -2.0, -1.5, *outside, -1.0])
+    assert first_bounce(y, 1.0, 0.25) == (-1.0, pytest.approx(out))
+    assert math.isnan(first_bounce(y[:-1], 1.0, 0.25)[1])  # nobody knows whether it does
+
+
+def test_a_last_bit_is_no_exit() -> None:
+    y = np.array([*np.arange(20.0, -1.0, -1.0), -1.0, 0.0, -1.0, -1.0])
+    assert first_bounce(y, 1.0, 1.0) == (-1.0, 0.0)
+
+
 def test_a_wall_is_known_best_before_the_hand_leaves_it() -> None:
     y = np.ones(200)
     y[10:15] = y[50:150] = y[160:190] = -1.0
