@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 _LATE_CYCLES = 0.5
 #: Cycles before the end in which the delay is looked for.
 _LATEST = 200_000
+#: The most rows that a record may lack; beyond, it is damaged.
+_MOST_LOST = 10_000_000
 #: Trips of a wall that throws the handle; the others are those of a fault.
 _OF_LIMITS = (Trip.SPEED, Trip.POSITION, Trip.ENERGY)
 
@@ -124,6 +126,8 @@ def judged(
         units: Scales of the drive.
         exceeded: The limits in force, if the handle exceeded one of them and that ended the run.
     """
+    motion_delay = _delay_of(signals)
+    signals = _without_gaps(signals)
     # A referent that exceeds them somewhat later exceeds them.
     more = (0, metrics.event_window(settings.bus.cycle_s) if exceeded else 0)
     asked = AskedWall(*(np.pad(numbers(signals, n), more, "edge") for n in AskedWall._fields))
@@ -144,7 +148,17 @@ def judged(
         )
         y, felt = (values[: signals.num_rows] for values in referent)
         found = summarise(signals, settings, units, y, felt, thrown)
-    return found | {"motion_delay_cycles": _delay_of(signals)}
+    return found | {"motion_delay_cycles": motion_delay}
+
+
+def _without_gaps(signals: "pa.Table") -> "pa.Table":
+    """Return the rows with one for each cycle: where some were lost, the one before, repeated."""
+    j = numbers(signals, "j")
+    lost = j[-1] + 1.0 - len(j)
+    if not 0.0 < lost <= _MOST_LOST:
+        return signals
+    before = np.searchsorted(j, np.arange(j[-1] + 1.0), side="right") - 1
+    return signals.take(np.maximum(before, 0))
 
 
 def _delay_of(signals: "pa.Table") -> list[float] | None:

@@ -93,6 +93,13 @@ def unknown() -> tuple[pa.Table, dict[str, Any]]:
     return table, judged(table, settings, found.units)
 
 
+def test_lost_rows_do_not_shift_times_and_referent() -> None:
+    table, settings, units, _ = strike("grip", 900.0)
+    summary = judged(table, settings, units)
+    lossy = pa.concat_tables([table.slice(0, 10), table.slice(40)])  # before the contact
+    assert judged(lossy, settings, units) == summary
+
+
 def test_summary_has_what_is_in_force(unknown: tuple[pa.Table, dict[str, Any]]) -> None:
     table, summary = unknown
     # The damping follows the mass in force, and yet it is one wall.
