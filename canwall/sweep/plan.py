@@ -168,7 +168,9 @@ def make_plan(base: Settings, given: Mapping[str, object], through: str = "sim")
     axes = {n: SweepAxis(n, tuple(v)) for n, v in defaults.items() if n not in axes} | axes
 
     def pop(names: Sequence[str]) -> SweepAxis | None:
-        return next((axes.pop(name) for name in names if name in axes), None)
+        axis = next((axes.pop(name) for name in names if name in axes), None)
+        # Tables and figures take the walls as they rise.
+        return axis and SweepAxis(axis.name, tuple(sorted(axis.values, key=float)))
 
     stiffness, damping = pop(STIFFNESS), pop(DAMPING)
     speed, phase = axes.pop("speed"), axes.pop("phase")

@@ -219,6 +219,13 @@ def test_an_interrupted_sweep_goes_on(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["parts.nc", "whole.nc"]
 
 
+def test_walls_rise_whatever_order_they_are_given_in() -> None:
+    plan = plan_of(stiffness=[30.0, 10, 20.0], damping=[0.1, 0.0])
+    assert plan.stiffness is not None
+    assert plan.stiffness.values == (10, 20.0, 30.0)
+    assert plan.damping.values == (0.0, 0.1)
+
+
 def test_a_plan_is_another_one_with_other_contents_of_its_files(tmp_path: Path) -> None:
     law, eds = tmp_path / "law.py", tmp_path / "drive.eds"
     text = "def force(wall):\n    return -wall.stiffness * wall.y\n"
