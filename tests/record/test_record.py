@@ -1,6 +1,7 @@
 """The ring, the writer process and the folder: what was put in comes out, whoever dies."""
 
 import contextlib
+import fcntl
 import json
 import os
 import resource
@@ -25,6 +26,7 @@ from canwall.config import ConfigError
 from canwall.record import ROW, Recorder, RecordError, Ring, RunFolder, read_signals
 from canwall.record.append import put_frame, put_row
 from canwall.record.columns import schema
+from canwall.record.folder import lock_folder
 from canwall.record.ring import FRAMES, ROWS, to_message
 
 LAWS = ["standard", "half_sample"]
@@ -493,3 +495,16 @@ def test_disk_that_is_full_is_told_at_once(tmp_path: Path) -> None:
     assert told == f"{tmp_path}: the record is incomplete: File too large"
     kept = read_signals(tmp_path / "signals.parquet")
     assert 0 <= kept.num_rows < len(rows)
+
+
+def test_who_looks_at_a_folder_does_not_disturb_its_lock(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    looking = os.open(tmp_path, os.O_RDONLY)
+    fcntl.flock(looking, fcntl.LOCK_SH)
+    assert not folder.is_being_written  # for somebody else who looks
+    threading.Timer(0.1, os.close, [looking]).start()
+    lock = lock_folder(tmp_path)
+    assert lock is not None
+    assert folder.is_being_written
+    os.close(lock)
+    assert not folder.is_being_written
