@@ -54,6 +54,8 @@ def ineffective_axis_notes(dataset: xr.Dataset) -> list[str]:
 def _limit_rows(dataset: xr.Dataset) -> Iterator[dict[str, str]]:
     worst = dataset["worst"]
     lowered = _is_lowered(dataset["stiffness_in_force"], worst)
+    # Motion and ripple are not judged in them.
+    unsettled = ~dataset["settled"].astype(bool) & (worst > 0.0)
     for labels, index in _conditions(dataset, [str(d) for d in worst.dims]):
         limit = worst.isel(index).item()
         best = dataset["limit"].isel(index).max().item()
@@ -66,6 +68,11 @@ def _limit_rows(dataset: xr.Dataset) -> Iterator[dict[str, str]]:
             **(
                 {"K in force\n[N·m/rad]": _least(dataset["stiffness_in_force"].isel(index))}
                 if lowered
+                else {}
+            ),
+            **(
+                {"strikes not\nsettled": str(unsettled.isel(index).sum().item())}
+                if unsettled.any()
                 else {}
             ),
             "best strike\n÷ worst": f"{best / limit:.3g}" if limit > 0.0 else "–",

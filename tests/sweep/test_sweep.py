@@ -647,6 +647,22 @@ def test_k_limits_are_shown_in_a_table(tmp_path: Path) -> None:
     assert f"{worst:.3g}" in done.stdout
 
 
+@pytest.mark.parametrize("settled", [[[True, True], [True, False]], [[True, True]] * 2])
+def test_strikes_that_never_settle_are_named(settled: list[list[bool]]) -> None:
+    dims = ("law", "damping", "speed", "phase")
+    names = ("limit", "ripple", "stiffness_in_force", "first_depth", "referent_first_depth")
+    strikes = np.array(settled)[:, None, :, None]
+    dataset = xr.Dataset(
+        {name: (dims, np.ones(strikes.shape)) for name in names}
+        | {"settled": (dims, strikes), "open_ended": (dims, np.zeros(strikes.shape, bool))}
+        | {name: (dims[:2], np.ones((2, 1))) for name in ("worst", "worst_normalised")},
+        {"law": ["a", "b"], "damping": [0.0], "speed": [1.0, 2.0], "phase": [0.0]},
+    )
+    columns = {str(column.header): list(column.cells) for column in sweep_table(dataset).columns}
+    expected = None if np.all(settled) else ["0", "1"]
+    assert columns.get("strikes not\nsettled") == expected
+
+
 def test_a_map_is_shown_in_a_table() -> None:
     dataset = xr.Dataset(
         {
