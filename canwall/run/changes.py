@@ -159,6 +159,8 @@ class _Attendant:
         except Exception as error:  # whatever it is, the sender waits
             mailbox.refuse(str(error) or type(error).__name__)
         else:
+            with suppress(Exception):
+                self.publish()  # who asked reads what is in force now
             mailbox.accept(cycle)
 
     def _put_in_force(self, request: Request, ended: threading.Event) -> int:

@@ -25,6 +25,7 @@ def test_attached_run(start: Start, tmp_path: Path) -> None:
         wait_for(lambda: run.status.phase == "rendering")
         before = run.settings.wall.stiffness_nm_per_rad
         softer = run.change(stiffness=12.5, tension="clamp", guard={"action": "act"})
+        assert run.settings.wall.stiffness_nm_per_rad == 12.5  # already
         marked = run.mark("here")
         wait_for(lambda: run.status.cycle > marked)
         signals = run.signals()
