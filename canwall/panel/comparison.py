@@ -150,14 +150,19 @@ class Comparison:
         with self._lock:
             procedure = self._in_progress()
             columns, rows = self._finish(reason)
-            if restore:
-                self._note({"blind": "end", "reason": reason, "answers": self._answered})
-                self._request({"do": "change", **procedure.restoring})
-            if self._answers is not None and rows:
-                name = f"{self._answers.path.stem}-table"
-                table = AnswerTable.create(self._answers.path.parent, name, columns)
-                for row in rows:
-                    table.add(row)
+            try:
+                if restore:
+                    self._note({"blind": "end", "reason": reason, "answers": self._answered})
+                    self._request({"do": "change", **procedure.restoring})
+            finally:
+                self._write_table(columns, rows)
+
+    def _write_table(self, columns: list[str], rows: list[list[Any]]) -> None:
+        if self._answers is not None and rows:
+            name = f"{self._answers.path.stem}-table"
+            table = AnswerTable.create(self._answers.path.parent, name, columns)
+            for row in rows:
+                table.add(row)
 
     def state(self) -> dict[str, Any]:
         """Return what a page may know, as JSON: before the end nothing of the walls."""

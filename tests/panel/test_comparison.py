@@ -208,6 +208,17 @@ def test_answers_survive_whatever_happens(tmp_path: Path) -> None:
     assert not made.active
 
 
+def test_a_run_that_refuses_the_last_change_keeps_the_table(tmp_path: Path) -> None:
+    run = Run()
+    made = comparison(run, tmp_path)
+    made.show("2")
+    made.answer(1)
+    run.refuses = True
+    with pytest.raises(ConfigError, match="the run refuses it"):
+        made.end()
+    assert len(rows(tmp_path, "comparison-table.csv")) == 1
+
+
 def test_staircases_of_two_laws_are_those_of_the_study(tmp_path: Path) -> None:
     run = Run()
     made = Comparison(run.request, run.note, tmp_path)
