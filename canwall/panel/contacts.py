@@ -66,11 +66,12 @@ class Contact:
 
 @dataclass
 class _Running:
-    """Sums of the contact that lasts."""
+    """Sums of the contact that lasts; `whole`: its beginning was seen."""
 
     start_s: float
     law: str
     stiffness: float
+    whole: bool
     energy_j: float = 0.0
     most_j: float = 0.0
     force_nm: float = 0.0
@@ -93,7 +94,7 @@ class Stretch:
         begins: True if the contact begins with them.
         stiffness: Stiffness in force at the last of them [N·m/rad].
         rows: Rows, dtype ROW, shape (n,), each of them given once.
-        ended: The contact, if it ended with them.
+        ended: The contact, if it ended with them and its beginning was seen.
     """
 
     begins: bool
@@ -152,23 +153,27 @@ class ContactMeter:
         touches_still = bool(metrics.contacts(y[-1:], force[-1:]))
         for touched in metrics.contacts(y, force):
             lasts = touches_still and touched.stop == len(rows)
-            yield self._measured(rows[touched], max(new - touched.start, 0), lasts)
+            # Before the first row of all, or of those after a gap, it may have lasted already.
+            whole = touched.start > 0
+            yield self._measured(rows[touched], max(new - touched.start, 0), lasts, whole)
 
-    def _measured(self, rows: NDArray[np.void], known: int, lasts: bool) -> Stretch:
+    def _measured(self, rows: NDArray[np.void], known: int, lasts: bool, whole: bool) -> Stretch:
         running, begins = self._running, self._running is None
         if running is None:
             first, known = rows[0], 0
             law = int(first["law"])
             name = self._scale.laws[law] if law < len(self._scale.laws) else ""
-            running = _Running(float(first["t_s"]), name, float(first["stiffness"]))
+            running = _Running(float(first["t_s"]), name, float(first["stiffness"]), whole)
         running.add(rows["y"], rows["force_applied"])
-        ended = None if lasts else self._ended(running, float(rows["t_s"][-1]))
+        ended = None
+        if not lasts:
+            self._free_since_s = float(rows["t_s"][-1])
+            ended = self._ended(running, self._free_since_s) if running.whole else None
         self._running = running if lasts else None
         return Stretch(begins, float(rows["stiffness_in_force"][-1]), rows[known:], ended)
 
     def _ended(self, contact: _Running, end_s: float) -> Contact:
         self._contacts += 1
-        self._free_since_s = end_s
         tolerance = self._scale.count_rad * contact.largest_nm
         return Contact(
             self._contacts,

@@ -173,6 +173,15 @@ def test_contacts_are_those_of_the_metrics(page: PageOf, run: FakeRun) -> None:
     assert np.array_equal(points[0][2], force[found[0]].astype(np.float32))
 
 
+def test_a_contact_without_its_beginning_is_not_measured(page: PageOf, run: FakeRun) -> None:
+    y = press(3000)
+    run.publish(rows_of(y[500:1600], first=500))  # in contact at first
+    run.publish(rows_of(y[2500:], first=2500))  # and after a gap
+    run.publish(rows_of(press(1000), first=3000))
+    assert page.event("contact")["start_s"] == pytest.approx(1.251, abs=0.002)
+    assert page.event("contact")["start_s"] == pytest.approx(3.251, abs=0.002)
+
+
 def test_passive_contact_and_chatter(page: PageOf, run: FakeRun) -> None:
     y = press(1000)
     lossy = np.maximum(-50.0 * y, 0.0) * (1.0 + 0.2 * (np.gradient(y) < 0.0))
