@@ -104,7 +104,8 @@ def fit_hand(position: Array, torque: Array, period: float, settings: Settings) 
         for value, part, half in zip(values, free, halves, strict=True)
     )
     for name, found in (("inertia", inertia), ("damping", damping), ("stiffness", stiffness)):
-        if found.low < 0.0:
+        # Little damping or stiffness is an operator's, no inertia is nobody's.
+        if (found.low if name == "inertia" else found.high) < 0.0:
             raise UntellingDataError(
                 f"the data do not tell the operator's {name}, which cannot be negative: "
                 f"{found.value:.3g} [{found.low:.3g}, {found.high:.3g}]; hold the handle still, "
