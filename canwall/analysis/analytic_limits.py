@@ -1,4 +1,4 @@
-"""Analytic limits of the stiffness, drawn over every map (theory, section 6).
+"""Analytic limits of the stiffness, drawn over every map (docs/results.md).
 
 K [N·m/rad] and B [N·m·s/rad] are the wall's stiffness and damping, m [kg·m²] and b [N·m·s/rad] the
 inertia and damping of everything that moves, T [s] is the sampling period, D the delay from a

@@ -1,4 +1,4 @@
-"""Felt ripple: what the hand feels of a wall that should be at rest (theory, section 5).
+"""Felt ripple: what the hand feels of a wall that should be at rest (docs/results.md).
 
 It is the r.m.s. of the force between handle and hand in 20–500 Hz. With no operator, it is the
 inertia of the handle times its acceleration.

@@ -1,6 +1,6 @@
 """Effective impedance of a rendered wall: what the operator feels, over frequency.
 
-G(ω) = F_h/Y of the operator's force on the position while he stays in contact (theory, section 5;
+G(ω) = F_h/Y of the operator's force on the position while he stays in contact (docs/results.md;
 J. E. Colgate and J. M. Brown, IEEE ICRA 1994). An ideal wall with an inertia M has
 G = K − M·ω² + j·ω·B.
 """

@@ -1,4 +1,4 @@
-"""K-limit: the stiffness up to which every wall is free of chatter (theory, section 5).
+"""K-limit: the stiffness up to which every wall is free of chatter (docs/results.md).
 
 Chatter is not monotone in K: a search by bisection jumps over islands of it. So walls are scanned
 upwards, each strike up to its first wall that chatters.

@@ -1,4 +1,4 @@
-"""Metrics of a wall (theory, section 5): energy, contacts, strikes and chatter.
+"""Metrics of a wall (docs/results.md): energy, contacts, strikes and chatter.
 
 What is felt of a wall at rest is in `felt`.
 

@@ -77,7 +77,7 @@ def wall_aimed_at(asked: AskedWall, j: int, mass: float, period: float) -> tuple
     """Return stiffness and damping at which a law aims in cycle j.
 
     K_e = min(K, c·m/T²) where there is a cap, and B = 2·ζ·√(K_e·m) where there is a damping ratio
-    (theory, section 8).
+    (docs/laws.md).
 
     Args:
         asked: The wall that is asked for.

@@ -1,4 +1,4 @@
-"""Measures of one strike: the metrics of theory, section 5, at one point of a sweep."""
+"""Measures of one strike: the metrics of docs/results.md, at one point of a sweep."""
 
 import math
 
@@ -51,7 +51,7 @@ MEASURES = np.dtype(
 MEASURE_DESCRIPTIONS = {
     "chatters": (
         "1",
-        "chatter by theory, section 5, or a trip while the referent stays within the limits",
+        "chatter by docs/results.md, or a trip while the referent stays within the limits",
     ),
     "chatters_counts": ("1", "chatter by makes and breaks of contact"),
     "chatters_amplitude": ("1", "chatter by the motion about the settled contact"),

@@ -7,7 +7,7 @@ slow motion of a hand. What a hand does faster than that shows in the residuals,
 measurements that differ; then nothing is concluded.
 
 A law pays for too little delay in its model with several times the stiffness that too much costs
-(theory, section 8): the upper end of the 95 % interval is what the axis gets.
+(docs/laws.md): the upper end of the 95 % interval is what the axis gets.
 """
 
 import math

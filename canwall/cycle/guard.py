@@ -3,7 +3,7 @@
 Two signs, of the position and of the force in force alone, so that neither model nor operator need
 be known:
 
-- **Ripple that does not decay.** The force within 20 to 500 Hz (theory, section 5) has swung a
+- **Ripple that does not decay.** The force within 20 to 500 Hz (docs/results.md) has swung a
   dozen times by more than RIPPLE_NM: within 100 ms of which no 20 ms were much quieter than the
   others, or within 200 ms without falling to half. A bounce dies away. While the force is lowered,
   half of either time is enough.

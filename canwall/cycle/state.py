@@ -48,7 +48,7 @@ MAX_LAWS = 16
 #: Cycles that count for the question if TPDOs have been missing of late.
 RECENT_CYCLES = 50
 
-#: Delay of a torque carried by a synchronous RPDO (theory, section 3).
+#: Delay of a torque carried by a synchronous RPDO (docs/laws.md).
 SYNCHRONOUS_DELAY = 1.0
 
 #: Largest bandwidth of a filter on an elastic shaft, as a part of the resonance.
@@ -233,7 +233,7 @@ def _model(settings: Settings) -> tuple[float, float, float]:
 def modelled_delay(settings: Settings) -> float:
     """Return D as configured, with the drive's own cycle and current loop added [periods].
 
-    A first-order lag counts as its time constant (theory, section 8). Raises ConfigError for a
+    A first-order lag counts as its time constant (docs/laws.md). Raises ConfigError for a
     delay of more than MAX_DELAY.
     """
     drive, delay = settings.drive, settings.estimator.delay_cycles

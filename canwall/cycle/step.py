@@ -265,7 +265,7 @@ def _torque_limit(cycle: Record) -> float:
 def _account_contact(cycle: Record, received: bool) -> None:
     """Account for the energy put out in this contact, and count the strikes that are over.
 
-    W = Σ f_applied[j]·(y[j+1] − y[j]) (theory, section 5), from the beginning of a contact on.
+    W = Σ f_applied[j]·(y[j+1] − y[j]) (docs/results.md), from the beginning of a contact on.
     """
     oriented = cycle.orientation * cycle.counts * cycle.rad_per_count
     if received:

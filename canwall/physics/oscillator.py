@@ -165,7 +165,7 @@ def zoh_coefficients(
 ) -> tuple[float, float, float, float, float, float]:
     """Return the zero-order-hold equivalent over one period: (Φ₁₁, Φ₁₂, Φ₂₁, Φ₂₂, Γ₁, Γ₂).
 
-    x[j+1] = Φ·x[j] + Γ·u[j] with x = [y, ẏ] and u held (theory, section 1; 5.17–5.19).
+    x[j+1] = Φ·x[j] + Γ·u[j] with x = [y, ẏ] and u held (docs/laws.md; 5.17–5.19).
     """
     kappa = spring / mass
     h1, h0, g1, _ = basis(viscous / mass, kappa, period)

@@ -7,7 +7,7 @@ from canwall.compiled import compiled
 
 @compiled
 def capped_stiffness(stiffness: float, cap: float, mass: float, period: float) -> float:
-    """Return K_e = min(K, c·m/T²), and K without a cap, c = 0 (theory, section 8)."""
+    """Return K_e = min(K, c·m/T²), and K without a cap, c = 0 (docs/laws.md)."""
     return min(stiffness, cap * mass / (period * period)) if cap > 0.0 else stiffness
 
 

@@ -254,7 +254,7 @@ class ClosedLoop:
 
 
 def loop_delay(settings: Settings) -> float:
-    """Return D of the simulated drive, the cycles from sample to torque (theory, section 3)."""
+    """Return D of the simulated drive, the cycles from sample to torque (docs/laws.md)."""
     assert settings.simulation is not None
     synchronous = settings.drive.torque_pdo != "immediate"
     return settings.simulation.torque_delay_cycles + (1.0 if synchronous else 0.0)

@@ -1,4 +1,4 @@
-"""Limits of a spring-damper wall over a Z-width map, as lines and points (theory, section 6)."""
+"""Limits of a spring-damper wall over a Z-width map, as lines and points (docs/results.md)."""
 
 from dataclasses import dataclass
 from enum import StrEnum

@@ -60,7 +60,7 @@ def _at_radius(name: str, mass_kg: float, damping: float, stiffness: float) -> O
     return Operator(name, mass_kg * square, damping * square, stiffness * square)
 
 
-#: Operators within the ranges of theory, section 7, from nobody to a hand with its arm.
+#: Operators within the ranges of docs/results.md, from nobody to a hand with its arm.
 OPERATORS = {
     operator.name: operator
     for operator in (
@@ -76,7 +76,7 @@ OPERATORS = {
 
 @dataclass(frozen=True)
 class Servo:
-    """Lag and cycle of a servo (theory, section 8), known to the model of the laws.
+    """Lag and cycle of a servo (docs/laws.md), known to the model of the laws.
 
     Attributes:
         name: Name on the axis `servo`.

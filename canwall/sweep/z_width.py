@@ -1,4 +1,4 @@
-"""Z-width map: walls on which no strike chatters, with the analytic limits (theory, section 6)."""
+"""Z-width map: walls on which no strike chatters, with the analytic limits (docs/results.md)."""
 
 from typing import Any
 

@@ -2,7 +2,7 @@
 
 State and model in force are interpolated between the two filters next to the mass that a regression
 finds (`regression`), at the delay that it finds. The gains of the filters are made beforehand
-(`bank_gains`). Coulomb friction is left to the bias force d̂ (theory, section 8). A hand that is
+(`bank_gains`). Coulomb friction is left to the bias force d̂ (docs/laws.md). A hand that is
 known has a bank of one filter: it holds its mass, and finds the delay.
 
 The bank works on an estimator in its steady state and hands over state and model to it. In a gap

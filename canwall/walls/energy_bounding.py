@@ -11,7 +11,7 @@ At c₁ = 2·c₂, the stiffest, it is |f[j]| ≤ |f[j−1] − c₁·Δy[j]|; a
 K as c₁, and is then not changed at all. No model of wall or operator is needed, only the damping b.
 
 A force that comes D periods late has c₂ = b/T − D·c₁ left, so that c₁ ≤ 2·b/(T·(1 + 2·D)): the
-stiffness of a spring that is passive with this delay (theory, section 6).
+stiffness of a spring that is passive with this delay (docs/laws.md).
 """
 
 import math

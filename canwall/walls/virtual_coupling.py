@@ -8,7 +8,7 @@ largest stiffness that is felt is K_c.
 
 By default the coupling is the stiffest that is passive with any operator, for the damping b of the
 model. Without delay that is b > K_c·T/2 + B_c, so K_c = 2·b/T and B_c = 0; with a delay of D = 1,
-b > 1.5·K_c·T − B_c up to K_c·T = 4·B_c (theory, section 6), so K_c = 0.8·b/T and B_c = b/5.
+b > 1.5·K_c·T − B_c up to K_c·T = 4·B_c (docs/laws.md), so K_c = 0.8·b/T and B_c = b/5.
 """
 
 from canwall.compiled import Record, compiled

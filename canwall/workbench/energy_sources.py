@@ -24,7 +24,7 @@ from canwall.workbench.traces import BALL, POSITION, SHORT_S, TIME, Traces, arou
 
 Array = NDArray[np.float64]
 
-#: Entry speed of the balls with which all phases of entry are judged (theory, section 7) [m/s].
+#: Entry speed of the balls with which all phases of entry are judged (docs/results.md) [m/s].
 ENTRY_SPEED = 5.0
 #: Time that includes one contact of the ball, but not the next [s].
 _ONE_BOUNCE_S = 10.0

@@ -132,7 +132,7 @@ def effort(recorded: RecordedRun, wall: Wall) -> Array:
     """Compute the force that a wall of the run, displayed or not, would hold from each SYNC on.
 
     Its law gets the sample and the estimated state of each cycle. The force is quantised and
-    limited like the drive's torque, and acts one SYNC later (theory, section 3).
+    limited like the drive's torque, and acts one SYNC later (docs/laws.md).
 
     Returns:
         Force [N·m], shape (cycles,).

@@ -25,7 +25,7 @@ def response(
 ) -> np.ndarray:
     """Positions at each SYNC under torques that take effect `delay` periods after them.
 
-    By the zero-order-hold equivalent over the two parts of each period (theory, section 3).
+    By the zero-order-hold equivalent over the two parts of each period (docs/laws.md).
     """
     n = int(delay)
     share = delay - n

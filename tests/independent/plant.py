@@ -51,7 +51,7 @@ def _at_handle(mass_kg: float, damping: float, stiffness: float) -> Operator:
     return Operator(*(value * RADIUS_M**2 for value in (mass_kg, damping, stiffness)))
 
 
-#: Within the ranges of theory, section 7.
+#: Within the ranges of docs/results.md.
 OPERATORS = {
     "none": Operator(0.0, 0.0, 0.0),
     "finger": _at_handle(0.004, 2.0, 300.0),

@@ -17,7 +17,7 @@ BOUNDED = settings(derandomize=True, deadline=None, max_examples=60)
 
 
 def bounce_period(stiffness: float, height: float) -> float:
-    """From rest at `height` back to it: unit mass, gravity, undamped wall (theory, section 2)."""
+    """From rest at `height` back to it: unit mass, gravity, undamped wall (5.7–5.10, corrected)."""
     speed, omega = math.sqrt(2.0 * GRAVITY * height), math.sqrt(stiffness)
     in_contact = (math.pi + 2.0 * math.atan(GRAVITY / (omega * speed))) / omega
     return 2.0 * speed / GRAVITY + in_contact

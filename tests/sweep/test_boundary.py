@@ -1,4 +1,4 @@
-"""Stability boundary of spring and damper in a sweep, compared with theory, section 6."""
+"""Stability boundary of spring and damper in a sweep, compared with docs/results.md."""
 
 import math
 from typing import Any

@@ -191,7 +191,7 @@ def changes_per_bounce(law: str, theta: float, bounces: int) -> Array:
     return np.diff(np.log(energies), axis=1)
 
 
-# The anchors of theory, section 7, are means over bounces that follow one another: as it gains,
+# The expected values are means over bounces that follow one another: as it gains,
 # standard strikes faster and faster and gains less and less, which makes their number matter.
 @pytest.mark.parametrize(("theta", "mean"), [(0.1, 0.177), (0.5, 0.79)])
 def test_standard_gains_energy_at_every_bounce(theta: float, mean: float) -> None:

@@ -58,7 +58,7 @@ def test_clamped_laws_do_not_pull(law: str) -> None:
 
 @pytest.mark.parametrize("theta", [0.1, 0.5])
 def test_clamping_makes_half_sample_active(theta: float) -> None:
-    """From the entry speed 5 of theory, section 7: +0.003 and +0.031 per bounce."""
+    """From the entry speed 5: +0.003 and +0.031 per bounce."""
     ball = Ball(stiffness=1.0, period=theta, height=0.0, speed=5.0, periods=30000)
     gains = {}
     for tension in ("allow", "clamp"):

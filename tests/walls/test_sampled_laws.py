@@ -1,4 +1,4 @@
-"""The laws that work on the sample alone, against their formulas (theory, section 4, 1 to 7)."""
+"""The laws that work on the sample alone, against their formulas (docs/laws.md)."""
 
 import math
 from collections.abc import Callable

@@ -21,7 +21,7 @@ every_law = pytest.mark.parametrize("law", LAWS)
 
 
 def dropped(theta: float, **changes: float | str) -> Ball:
-    """g = m = height = 1, T = 0.1, 3000 periods: the ball of theory, section 7."""
+    """g = m = height = 1, T = 0.1, 3000 periods."""
     return replace(Ball(stiffness=(theta / 0.1) ** 2), **changes)  # type: ignore[arg-type]
 
 

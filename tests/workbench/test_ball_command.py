@@ -59,7 +59,7 @@ def bounce(
 
 
 def end_over_start(columns: Array) -> float:
-    """Energy of the ball of theory, section 7, at the last sample outside, over that at first."""
+    """Energy of the ball of test_ball.py, at the last sample outside, over that at first."""
     _, y, v, _ = columns
     last = np.flatnonzero(y >= 0.0)[-1]
     return float((0.5 * v[last] ** 2 + y[last]) / (0.5 * v[0] ** 2 + y[0]))

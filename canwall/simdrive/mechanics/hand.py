@@ -1,7 +1,7 @@
 """The hand on the simulated drive's handle: its force, period by period.
 
 The hand is a mass, a spring and a damper about a moving hand position, and a muscle torque
-(theory, section 1). By its script it strikes: it goes to where it presses, stays, and withdraws.
+(docs/laws.md). By its script it strikes: it goes to where it presses, stays, and withdraws.
 It moves as hands do, with the least jerk (Flash and Hogan 1985). At each SYNC it is exactly on
 that path, between two of them on the straight line that joins them, so that over one period all
 its forces are affine functions of time and the motion stays exact.
