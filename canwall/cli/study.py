@@ -1,5 +1,6 @@
 """Commands in which a person at the handle judges walls: `study staircase` and others."""
 
+import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -190,21 +191,26 @@ def _shown(cell: object) -> str:
     return "–" if cell is None else f"{cell:.3g}" if isinstance(cell, float) else str(cell)
 
 
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
 def _print_verdicts(session: "Session", as_json: bool) -> None:
     from canwall.study import stiffness_limits
 
+    # None where there is none.
+    limits = {
+        name: {"free_of_chatter_up_to": free or None, "chatters_from": _finite(chatters)}
+        for name, (free, chatters) in stiffness_limits(session.verdicts).items()
+    }
     if as_json:
-        limits = {
-            name: {"free_of_chatter_up_to": free, "chatters_from": chatters}
-            for name, (free, chatters) in stiffness_limits(session.verdicts).items()
-        }
         print_json({"table": session.table, "limits": limits, "verdicts": session.verdicts})
         return
     table = Table(title="What the person said", title_justify="left")
     for column in ("law", "free of chatter up to", "chatters from"):
         table.add_column(column, justify="left" if column == "law" else "right")
-    for name, (free, chatters) in stiffness_limits(session.verdicts).items():
-        table.add_row(name, f"{free:.4g} N·m/rad", f"{chatters:.4g} N·m/rad")
+    for name, found in limits.items():
+        table.add_row(name, *("–" if k is None else f"{k:.4g} N·m/rad" for k in found.values()))
     console.print()
     if session.verdicts:
         console.print(table)

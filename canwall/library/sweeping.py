@@ -110,7 +110,7 @@ def law_table(
     """Compute a table of laws and operators (`canwall sweep --table`).
 
     Args:
-        name: laws (K-limits), cap, first-strike, or shaft.
+        name: laws (K-limits), cap, bench, first-strike, or shaft.
         config: As for `canwall.load`; its `[sweep]` is ignored.
         law: Laws; without any, those of the table.
         operator: Operators.

@@ -38,9 +38,6 @@ from canwall.record.folder import (
 )
 from canwall.record.ring import Ring, to_message
 
-if is_installed("plot"):
-    pass  # now, while the master has other things to do
-
 #: Rows per row group; the last one may have fewer.
 _ROW_GROUP = 8192
 _POLL_S = 0.02

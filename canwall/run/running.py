@@ -222,7 +222,13 @@ def _run_folders(many: Sequence[Settings], output: Path | None, bus_log: str) ->
     if len(many) == 1:
         return [RunFolder.create(output, many[0].to_toml(), bus_log)]
     base = output or RunFolder.default_path()
-    return [
-        RunFolder.create(base / f"node{settings.drive.node_id}", settings.to_toml(), bus_log)
-        for settings in many
-    ]
+    folders: list[RunFolder] = []
+    try:
+        for settings in many:
+            path = base / f"node{settings.drive.node_id}"
+            folders.append(RunFolder.create(path, settings.to_toml(), bus_log))
+    except ConfigError:
+        for folder in folders:
+            folder.config.unlink(missing_ok=True)
+        raise
+    return folders

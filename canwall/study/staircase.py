@@ -35,7 +35,7 @@ class Staircase:
     Steps are factors: 2 at first, the square root of the last one after each reversal. The first
     reversal with a factor of `finest` or less ends the staircase: the limit lies between the last
     two walls. The steps after a wrong answer correct it. The staircase also ends at the ceiling,
-    and after walls that chatter down to 1/64 of the start or of the last wall that was free.
+    and after a wall that chatters below 1/64 of the start or of the last wall that was free.
 
     Attributes:
         start: Stiffness of the first wall [N·m/rad].
