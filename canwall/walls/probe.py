@@ -20,6 +20,7 @@ PROBE = np.dtype(
         ("half", "i8"),  # half its period [samples]
         ("stronger", "f8"),  # torque of the present probe, as a multiple of that
         ("samples", "i8"),  # of the present probe up to now
+        ("begun", "i8"),  # samples for which it goes on once it has begun, up to a contact
         ("acts", "?"),  # the force of this cycle is a probe's
         ("in_flight", "f8", (FORCES_KEPT,)),  # torques of probes, newest first
     ],
@@ -47,12 +48,15 @@ def set_probe(
         lightest: Smallest mass that there may be, all that moves.
         period: T [s].
         count: One count of the encoder [rad].
-        slower: Multiple of the usual period and motion, for an observer that is as much slower.
+        slower: Multiple of the usual period and motion, for an observer that is as much slower
+            behind an elastic shaft.
     """
     probe["resolution"], probe["lightest"] = count, lightest
     probe["half"] = half = slower * max(round(_HALF_S / period), _SAMPLES)
     quarter = 0.5 * half * period
     probe["torque"] = slower * _COUNTS * count * lightest / quarter**2
+    # Behind a shaft that swings the velocity comes and goes; a probe that did so would drive it.
+    probe["begun"] = round(_BEFORE_S / period) if slower > 1 else 0
 
 
 def reset_probe(probe: np.void) -> None:
@@ -70,7 +74,8 @@ def probe_torque(
     handle goes that way faster than the encoder's steps hide. mass: the one in force. known: True
     if it was found with little doubt; of a stranger that comes fast there is little time to learn.
     """
-    if not (comes and 0.0 < wall.y <= -wall.v * _BEFORE_S):
+    goes_on = 0 < probe.samples < probe.begun and wall.y > 0.0
+    if not goes_on and not (comes and 0.0 < wall.y <= -wall.v * _BEFORE_S):
         probe.samples = 0
         return 0.0
     # The first half is half as long: the handle is pushed about its own path. It stays about it if

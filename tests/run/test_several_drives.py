@@ -98,7 +98,7 @@ def test_refused_folder_leaves_no_other(tmp_path: Path) -> None:
     taken = tmp_path / "node6" / "config.toml"
     taken.parent.mkdir()
     taken.write_text("of another run")
-    with pytest.raises(ConfigError, match="config.toml"):
+    with pytest.raises(ConfigError, match=r"config\.toml"):
         run_all([settings_of(5), settings_of(6)], tmp_path)
     assert not (tmp_path / "node5" / "config.toml").exists()
     assert taken.read_text() == "of another run"

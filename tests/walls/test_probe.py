@@ -87,6 +87,24 @@ def test_probe_for_a_slower_observer_lasts_longer_and_moves_the_handle_by_more()
     assert slow["torque"][0] == pytest.approx(0.5 * usual["torque"][0])
 
 
+def test_probe_behind_a_shaft_does_not_follow_its_swing() -> None:
+    """A velocity that comes and goes with the shaft ends no probe; new ones would push again."""
+    torques = {}
+    for slower in (1, 2):
+        probe, wall = made(slower), np.zeros(1, WALL)
+        wall["y"] = 0.01
+        torques[slower] = np.zeros(60)
+        for j in range(60):
+            wall["v"] = -0.5 if j % 4 < 2 else 0.3
+            going = float(wall["v"][0]) * PERIOD, j % 4 < 2, LIGHTEST, True
+            torques[slower][j] = probe_torque(probe[0], wall[0], *going)
+        wall["y"] = -1e-4
+        assert probe_torque(probe[0], wall[0], -0.5 * PERIOD, True, LIGHTEST, True) == 0.0
+    assert np.sign(torques[1][:8]).tolist() == [1, 1, 0, 0] * 2
+    assert np.sign(torques[2][:20]).tolist() == 4 * [1] + 8 * [-1] + 8 * [1]
+    assert np.all(torques[2] != 0.0)
+
+
 def test_torques_of_probes_are_told_from_the_wall_s() -> None:
     probe, wall = made(), np.zeros(1, WALL)
     wall["y"], wall["v"] = 0.01, -0.5
