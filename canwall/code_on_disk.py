@@ -85,8 +85,9 @@ def _folders() -> list[Path]:
     return folders
 
 
+@functools.cache
 def is_first_start() -> bool:
-    """Return True if nothing compiled from the present sources is on disk."""
+    """Return True if nothing compiled from the present sources was on disk when first asked."""
     return not any(folder.is_dir() for folder in _folders())
 
 

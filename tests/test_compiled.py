@@ -127,6 +127,19 @@ def test_several_first_starts_at_once(installation: Installation) -> None:
     assert installation.run() == "(0.0, -2.0) compiled"
 
 
+def test_first_start_is_one_to_its_end(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Also once it has kept its first function: what compiles beside it is asked for later."""
+    folder = tmp_path / "compiled"
+    monkeypatch.setattr(code_on_disk, "_folders", lambda: [folder])
+    code_on_disk.is_first_start.cache_clear()
+    assert code_on_disk.is_first_start()
+    folder.mkdir()
+    assert code_on_disk.is_first_start()
+    code_on_disk.is_first_start.cache_clear()
+    assert not code_on_disk.is_first_start()
+    code_on_disk.is_first_start.cache_clear()
+
+
 @pytest.mark.slow
 def test_process_whose_sources_change_keeps_nothing(installation: Installation) -> None:
     """It may have imported a source before or after the change."""

@@ -118,8 +118,11 @@ def sweep(
     console.print(sweep_table(dataset))
     for note in ineffective_axis_notes(dataset):
         console.print(note, soft_wrap=True, highlight=False)
+    # A single stiffness makes no figure.
+    drawable = plan.stiffness is None or len(plan.stiffness.values) > 1
+    drawn = f"; canwall plot {output} draws them" if drawable else ""
     console.print(
-        f"{plan.point_count} points: {output}; canwall plot {output} draws them",
+        f"{plan.point_count} points: {output}{drawn}",
         soft_wrap=True,
         highlight=False,
     )

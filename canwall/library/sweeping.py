@@ -144,7 +144,7 @@ def sweep_figures(dataset: xr.Dataset) -> "dict[str, Figure]":
         The figures by name, "z-width", "energy" …, which notebooks display.
 
     Raises:
-        canwall.errors.InputError: If the sweep has a single point.
+        canwall.errors.InputError: If the sweep has a single stiffness.
     """
     from canwall.library.figures import shown_in_notebooks
     from canwall.sweep.figures import draw_sweep

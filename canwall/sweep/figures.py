@@ -44,7 +44,7 @@ def write_sweep_figures(dataset: xr.Dataset, stem: Path) -> list[Path]:
         Paths of the figures.
 
     Raises:
-        InputError: If the sweep is a single point, or the result of a table, or the figures
+        InputError: If the sweep is a single stiffness, or the result of a table, or the figures
             cannot be written.
     """
     written: list[Path] = []
@@ -62,7 +62,7 @@ def write_sweep_figures(dataset: xr.Dataset, stem: Path) -> list[Path]:
 def draw_sweep(dataset: xr.Dataset) -> Iterator[tuple[str, Figure]]:
     """Yield name and figure of everything that the axes of the sweep allow to be drawn.
 
-    Raises InputError if the sweep is a single point, or the result of a table.
+    Raises InputError if the sweep is a single stiffness, or the result of a table.
     """
     if "table" in dataset.attrs:
         raise InputError(
@@ -71,7 +71,7 @@ def draw_sweep(dataset: xr.Dataset) -> Iterator[tuple[str, Figure]]:
         )
     kinds = _kinds(dataset)
     if not kinds:
-        raise InputError("the sweep has a single point: there is nothing to draw")
+        raise InputError("the sweep has a single stiffness: there is nothing to draw")
     for name, of_kind, drawn, draw in kinds:
         with mpl.rc_context(STYLE):
             figures = _draw_panels(of_kind, drawn, draw)

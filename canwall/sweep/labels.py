@@ -1,6 +1,7 @@
 """Text in the figures of a sweep: labels of axes, titles of panels, shared parameters."""
 
 import math
+import tomllib
 
 import numpy as np
 import xarray as xr
@@ -73,7 +74,15 @@ def shared_parameters(dataset: xr.Dataset) -> str:
     # An axis that the figure shows at one of its values.
     for name in ("damping", "damping_normalised"):
         if name in dataset.coords and name not in dataset.dims:
-            parts.append(_TITLES[name].format(f"{dataset[name].item():g}"))
+            value = dataset[name].item()
+            ratio = None if value else _damping_ratio(dataset)
+            parts.append(_TITLES[name].format(f"{value:g}") if ratio is None else f"ζ = {ratio:g}")
     strikes = math.prod(dataset.sizes[name] for name in STRIKES)
     parts.append("1 strike" if strikes == 1 else f"the worst of {strikes} strikes")
     return ", ".join(parts)
+
+
+def _damping_ratio(dataset: xr.Dataset) -> float | None:
+    """Return the damping ratio of the configuration, which stands in for a damping of 0."""
+    ratio: float | None = tomllib.loads(dataset.attrs["configuration"])["wall"].get("damping_ratio")
+    return ratio

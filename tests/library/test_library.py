@@ -353,7 +353,7 @@ def test_figures_of_a_sweep() -> None:
     figures = canwall.sweep_figures(found)
     assert list(figures) == ["energy", "amplitude", "frequency", "z-width"]
     assert list(figures) == [name for name, _ in draw_sweep(found)]
-    with pytest.raises(InputError, match="single point"):
+    with pytest.raises(InputError, match="single stiffness"):
         canwall.sweep_figures(found.isel(stiffness=[0]))
 
 

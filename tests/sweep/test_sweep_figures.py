@@ -16,6 +16,7 @@ from canwall.analysis.analytic_limits import CEILINGS, delayed_stiffness, stable
 from canwall.errors import InputError
 from canwall.sweep import make_plan, read_sweep, sweep
 from canwall.sweep.figures import write_sweep_figures
+from canwall.sweep.labels import shared_parameters
 
 STRIKE: dict[str, Any] = {"speed": [1.0], "phase": [0.0, 0.5], "press": 0.3}
 
@@ -140,7 +141,7 @@ def test_limits_of_one_condition_and_what_cannot_be_drawn(tmp_path: Path) -> Non
     with pytest.raises(InputError, match="cannot be written"):
         write_sweep_figures(limits, tmp_path / "nowhere" / "limits")
     point = swept(tmp_path / "point.nc", stiffness=[10.0])
-    with pytest.raises(InputError, match="has a single point"):
+    with pytest.raises(InputError, match="has a single stiffness"):
         write_sweep_figures(point, tmp_path / "point")
 
 
@@ -160,3 +161,11 @@ def test_a_file_that_is_no_sweep(tmp_path: Path, content: bytes | None, line: st
     assert done.returncode == 2
     assert done.stderr.startswith(f"canwall: a.nc: {line}")
     assert len(done.stderr.splitlines()) == 1
+
+
+def test_damping_ratio_stands_where_a_damping_would(tmp_path: Path) -> None:
+    settings = settings_with({"wall.damping_ratio": 0.5})
+    of_ratio = sweep(make_plan(settings, {**STRIKE, "stiffness": [5.0, 10.0]}), tmp_path / "r.nc")
+    assert "ζ = 0.5" in shared_parameters(of_ratio.isel(damping_normalised=0))
+    undamped = swept(tmp_path / "b.nc", stiffness=[5.0, 10.0])
+    assert "B·T/m = 0," in shared_parameters(undamped.isel(damping_normalised=0))
