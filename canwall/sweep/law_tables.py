@@ -71,6 +71,9 @@ BENCHES: dict[str, dict[str, Sequence[float | str]]] = {
     "torque constant 10 % less": {"simulation.torque_constant_error": (-0.1,)},
     "torque constant 10 % more": {"simulation.torque_constant_error": (0.1,)},
     "stiction twice the Coulomb friction": {"breakaway": (2.0,)},
+    "elastic shaft, 600 Hz": {"simulation.shaft_hz": (600.0,)},
+    "elastic shaft, 400 Hz": {"simulation.shaft_hz": (400.0,)},
+    "elastic shaft, 250 Hz": {"simulation.shaft_hz": (250.0,)},
 }
 _BENCH_DRAWS = 24
 #: First strikes: the wall [N·m/rad], the speeds of approach [rad/s], and the phases.
