@@ -17,6 +17,8 @@ from canwall.simdrive import TORQUE_LIMITS
 from canwall.sweep.strike import OPERATORS, SERVOS, law_model, strike_settings
 from canwall.walls import MAX_DELAY
 
+#: Largest rate of the SYNC [Hz]: the least bus.cycle_s.
+_FASTEST_HZ = 1e5
 #: Largest number of values on one axis: more of them are a typing error.
 _MOST_VALUES = 1_000_000
 
@@ -167,8 +169,9 @@ def _check(name: str, value: Value) -> None:
     if not (value > low or (low_allowed and value == low)):  # type: ignore[operator]
         bound = "at least" if low_allowed else "greater than"
         raise InputError(f"sweep axis {name}: has to be {bound} {low:g}, not {value!r}")
-    if name == "delay" and value > MAX_DELAY:  # type: ignore[operator]
-        raise InputError(f"sweep axis delay: has to be at most {MAX_DELAY}, not {value!r}")
+    most = {"delay": MAX_DELAY, "rate": _FASTEST_HZ}.get(name, math.inf)
+    if value > most:  # type: ignore[operator]
+        raise InputError(f"sweep axis {name}: has to be at most {most:g}, not {value!r}")
     if name == "counts" and value != int(value):
         raise InputError(f"sweep axis counts: has to be a whole number, not {value!r}")
 

@@ -166,6 +166,6 @@ def test_a_file_that_is_no_sweep(tmp_path: Path, content: bytes | None, line: st
 def test_damping_ratio_stands_where_a_damping_would(tmp_path: Path) -> None:
     settings = settings_with({"wall.damping_ratio": 0.5})
     of_ratio = sweep(make_plan(settings, {**STRIKE, "stiffness": [5.0, 10.0]}), tmp_path / "r.nc")
-    assert "ζ = 0.5" in shared_parameters(of_ratio.isel(damping_normalised=0))
+    assert "ζ = 0.5" in shared_parameters(of_ratio.isel(damping=0))
     undamped = swept(tmp_path / "b.nc", stiffness=[5.0, 10.0])
-    assert "B·T/m = 0," in shared_parameters(undamped.isel(damping_normalised=0))
+    assert "B = 0 N·m·s/rad," in shared_parameters(undamped.isel(damping=0))
