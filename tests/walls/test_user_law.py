@@ -68,14 +68,14 @@ def test_example_without_growth_is_the_clamped_midpoint(example: str) -> None:
 
 @pytest.mark.slow
 def test_ball_command_finds_the_file_from_where_it_is_called(example: str, tmp_path: Path) -> None:
-    for _start in ("compiled", "as compiled by the first"):
+    for start in ("compiled", "as compiled by the first"):
         done = command(
             *("ball", "--law", "my_law.py:my_law", "--option", "growth=2", "--stiffness", "4"),
-            *("--periods", "200", "--output", "ball.csv"),
+            *("--periods", "200", "--output", f"{start}.csv"),
             cwd=tmp_path,
         )
         assert (done.returncode, done.stderr) == (0, "")
-    _, y, v, force = np.loadtxt(tmp_path / "ball.csv", delimiter=",", skiprows=1).T
+    _, y, v, force = np.loadtxt(tmp_path / f"{start}.csv", delimiter=",", skiprows=1).T
     expected = stiffening(y, v, 4.0, 2.0, 0.1)[:-1]
     np.testing.assert_allclose(force[:-1], expected, rtol=0.0, atol=1e-12)
     assert force.max() > 1.0
