@@ -104,7 +104,7 @@ def describe_limits(
         well=inside,
         do="" if inside else "turn the handle there, or move limits.position_rad and the wall",
     )
-    depth = (wall.position_rad - here) * (1.0 if wall.side == "below" else -1.0)
+    depth = (wall.position_rad - here) * wall.orientation
     if depth > 0.0:
         findings.add(
             "limits",

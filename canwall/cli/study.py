@@ -191,26 +191,23 @@ def _shown(cell: object) -> str:
     return "–" if cell is None else f"{cell:.3g}" if isinstance(cell, float) else str(cell)
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
 def _print_verdicts(session: "Session", as_json: bool) -> None:
     from canwall.study import stiffness_limits
 
-    # None where there is none.
-    limits = {
-        name: {"free_of_chatter_up_to": free or None, "chatters_from": _finite(chatters)}
-        for name, (free, chatters) in stiffness_limits(session.verdicts).items()
-    }
+    limits = stiffness_limits(session.verdicts)
     if as_json:
-        print_json({"table": session.table, "limits": limits, "verdicts": session.verdicts})
+        by_name = {
+            name: {"free_of_chatter_up_to": free or None, "chatters_from": chatters}
+            for name, (free, chatters) in limits.items()
+        }
+        print_json({"table": session.table, "limits": by_name, "verdicts": session.verdicts})
         return
     table = Table(title="What the person said", title_justify="left")
     for column in ("law", "free of chatter up to", "chatters from"):
         table.add_column(column, justify="left" if column == "law" else "right")
     for name, found in limits.items():
-        table.add_row(name, *("–" if k is None else f"{k:.4g} N·m/rad" for k in found.values()))
+        shown = ("–" if k in (0.0, math.inf) else f"{k:.4g} N·m/rad" for k in found)
+        table.add_row(name, *shown)
     console.print()
     if session.verdicts:
         console.print(table)

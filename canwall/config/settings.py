@@ -104,6 +104,11 @@ class Wall(Section):
     divider: int = Field(1, ge=1, le=1000)
     alternate: Names = ()
 
+    @property
+    def orientation(self) -> float:
+        """Direction out of the wall on the drive's axis: 1 of one below, −1 of one above."""
+        return 1.0 if self.side == "below" else -1.0
+
 
 class Estimator(Section):
     """`[estimator]`: the Kalman filter.

@@ -434,7 +434,7 @@ def set_wall(cycle: NDArray[np.void], wall: Wall, laws: Sequence[Law]) -> None:
     law = find_law(wall.law, wall.deadbeat)
     options = law.option_values(wall.options)
     index = [known.name for known in laws].index(law.name)
-    cycle["orientation"] = 1.0 if wall.side == "below" else -1.0
+    cycle["orientation"] = wall.orientation
     cycle["is_blind"] = False
     rendered = cycle["rendered"][0]
     known = rendered["wall"][0]

@@ -97,7 +97,7 @@ class FaultKind:
 
     @property
     def effect(self) -> object:
-        """What overlapping faults share: the last of them to end ends it."""
+        """Effect that overlapping faults share: the last of them to end ends it."""
         return self if self.independent else type(self)
 
     @property

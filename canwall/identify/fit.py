@@ -239,17 +239,15 @@ class _Fit:
         totals = [*(max(rigid[0] - late, 0.05) for late in (0.0, 0.15)), *_TOTALS]
         frequencies = np.geomspace(0.08 * nyquist, 1.6 * nyquist, 40)
         guesses = [
-            min(
-                (np.array([total, min(lag / total, 1.0), hz, 0.03]) for total in totals),
-                key=self._cost,
-            )
+            [np.array([total, min(lag / total, 1.0), hz, 0.03]) for total in totals]
             for hz in frequencies
         ]
-        guesses.sort(key=self._cost)
-        if self._cost(guesses[0]) > (1.0 - _SHAFT_EXPLAINS) * before:
+        costs = np.array([[self._cost(guess) for guess in of_hz] for of_hz in guesses])
+        if costs.min() > (1.0 - _SHAFT_EXPLAINS) * before:
             return None
         # A resonance and its image beyond the Nyquist frequency look alike on a coarse grid.
-        x = min((self.refined(guess) for guess in guesses[:_REFINED]), key=self._cost)
+        best = [(k, int(costs[k].argmin())) for k in np.argsort(costs.min(axis=1))[:_REFINED]]
+        x = min((self.refined(guesses[k][total]) for k, total in best), key=self._cost)
         linear, covariance, _ = self._everything(x)
         ratio = linear[1] / linear[0]
         significant = linear[1] > _SHAFT_SIGNIFICANCE * math.sqrt(covariance[5, 5])

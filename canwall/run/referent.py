@@ -75,7 +75,7 @@ class Referent:
     def __init__(self, settings: Settings, simulation: Simulation, cycles: int) -> None:
         self._period = settings.bus.cycle_s
         self._hand = simulation.hand
-        self._side = 1.0 if settings.wall.side == "below" else -1.0
+        self._side = settings.wall.orientation
         self._constant, slope = simdrive.hand_force(simulation.hand, self._period, cycles)
         self._slope = self._side * slope
         self._handle = make_plant(**simdrive.handle_plant(simulation))

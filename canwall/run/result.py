@@ -139,9 +139,8 @@ def judged(
     if referent is None:
         found = summarise(signals, settings, units, None, None)
     else:
-        side = 1.0 if settings.wall.side == "below" else -1.0
         thrown = exceeded is not None and keeps_limits(
-            wall_position + side * referent.y,
+            wall_position + settings.wall.orientation * referent.y,
             exceeded.position_rad,
             exceeded.speed_rad_s,
             settings.bus.cycle_s,

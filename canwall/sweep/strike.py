@@ -180,7 +180,7 @@ def strike_settings(
     """
     simulation, period = settings.simulation, settings.bus.cycle_s
     assert simulation is not None
-    sign = 1.0 if settings.wall.side == "below" else -1.0
+    sign = settings.wall.orientation
     wall = settings.wall.position_rad
     start = start_rad + phase * speed_rad_s * period
     stiffness = simulation.hand.stiffness_nm_per_rad
