@@ -84,18 +84,19 @@ class Wall(Section):
     """`[wall]`: position, stiffness and damping, and the law that renders it.
 
     Attributes:
-        damping_ratio: ζ of B = 2·ζ·√(K·m) with the mass in force, in place of a given damping.
+        damping_ratio: ζ of B = 2·ζ·√(K·m) with the mass in force; 0: B as given. Default: 0.5, and
+            0 beside a damping that is given.
         cap: c of the largest stiffness in force, c·m/T² with the mass in force, and on an elastic
-            shaft no more than what leaves its resonance stable.
+            shaft no more than what leaves its resonance stable; 0: as asked.
     """
 
-    law: str = "half_sample"
+    law: str = "mean_force"
     position_rad: Number = 0.0
     side: Literal["below", "above"] = "below"
     stiffness_nm_per_rad: NonNegative = 50.0
     damping_nm_s_per_rad: NonNegative = 0.0
-    damping_ratio: Annotated[Positive, Field(le=100.0)] | None = None
-    cap: Positive | None = None
+    damping_ratio: Annotated[NonNegative, Field(le=100.0)] = 0.5
+    cap: NonNegative = 0.8
     deadbeat: bool = False
     velocity: Literal["difference", "estimated"] = "difference"
     options: dict[str, Number] = Field(default_factory=dict)
@@ -103,6 +104,13 @@ class Wall(Section):
     passivity_nm_s_per_rad: NonNegative = 0.0
     divider: int = Field(1, ge=1, le=1000)
     alternate: Names = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _damping_as_given(cls, given: object) -> object:
+        if isinstance(given, dict) and "damping_nm_s_per_rad" in given:
+            return {"damping_ratio": 0.0} | given
+        return given
 
     @property
     def orientation(self) -> float:
@@ -241,7 +249,7 @@ def check_divider(wall: Wall, mechanics: Mechanics) -> None:
     if wall.divider > 1 and wall.cap and mechanics.shaft_hz:
         raise ValueError(
             "wall.divider: has to be 1 with mechanics.shaft_hz and wall.cap, whose bound is "
-            "that of a law in every cycle; leave out wall.cap"
+            "that of a law in every cycle; or wall.cap 0"
         )
 
 
@@ -264,7 +272,7 @@ class WallChange(_WallKeys):
         if self.law is not None:
             update.setdefault("options", {})  # options belong to the previous law
         if self.damping_nm_s_per_rad is not None:
-            update.setdefault("damping_ratio", None)  # a damping that is given takes its place
+            update.setdefault("damping_ratio", 0.0)  # a damping that is given takes its place
         return wall.model_copy(update=update), changed(limits, self.limits)
 
 
@@ -431,7 +439,7 @@ class Settings(Section):
         """
         update: dict[str, Any] = {}
         if damping:
-            update["wall"] = self.wall.model_copy(update={"damping_ratio": None})
+            update["wall"] = self.wall.model_copy(update={"damping_ratio": 0.0})
         if law:
             changes = (change.model_copy(update={"law": None}) for change in self.schedule)
             update["schedule"] = tuple(changes)
@@ -454,9 +462,14 @@ class Settings(Section):
 
     @property
     def real_time(self) -> bool:
-        """True if SYNCs follow the clock, False if they go as fast as the simulation answers."""
+        """True if SYNCs follow the clock, False if they go as fast as the simulation answers.
+
+        A wall in memory without an end is one to be watched: as fast as possible, its record would
+        grow by megabytes a second.
+        """
         if self.bus.pace == "auto":
-            return self.simulation is None or self.simulation.real_time
+            endless = self.embedded and self.run.duration_s is None
+            return self.simulation is None or self.simulation.real_time or endless
         return self.bus.pace == "real_time"
 
     def to_toml(self) -> str:

@@ -68,7 +68,8 @@ class DelayTest:
         per_mille = min(torque, farthest) / float(axis.cycle["nm_per_mille"][0])
         amplitude = max(1, math.floor(per_mille))
         self._parts = settings.estimator.measurements
-        self.cycles = self._parts[-1].stop
+        # None of its torques is in flight any more when the wall begins.
+        self.cycles = self._parts[-1].stop + MAX_DELAY + 1
         self._torques = np.zeros(self.cycles, np.int64)
         for k, part in enumerate(self._parts):
             self._torques[part] = amplitude * excitation(cycles, length, _SEED + k)

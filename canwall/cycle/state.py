@@ -449,7 +449,7 @@ def set_wall(cycle: NDArray[np.void], wall: Wall, laws: Sequence[Law]) -> None:
         mass, viscous, spring = (known[name].item() for name in ("mass", "viscous", "spring"))
         set_plant(known, mass, viscous, spring, cycle["period"].item() * wall.divider)
     set_referent(known, wall.stiffness_nm_per_rad, wall.damping_nm_s_per_rad, options)
-    known["damping_ratio"], known["cap"] = wall.damping_ratio or 0.0, wall.cap or 0.0
+    known["damping_ratio"], known["cap"] = wall.damping_ratio, wall.cap
     known["tension"] = TENSION[wall.tension]
     known["passivity_damping"] = wall.passivity_nm_s_per_rad
     _bound_stiffness(cycle)

@@ -440,8 +440,9 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
         predict(cycle.losing[0], sent)
     applied = acting_force(estimator, estimator.in_flight)
     probes = cycle.bank[0].probe[0].in_flight
-    # What shows who is coming is no force of the wall.
-    cycle.force_applied = applied - acting_force(estimator, probes)
+    # What shows who is coming is no force of the wall, nor is what shows the delay.
+    measures = cycle.phase == _MEASURING
+    cycle.force_applied = 0.0 if measures else applied - acting_force(estimator, probes)
     if due:
         set_applied_force(wall, sent - probes[0])
         set_applied_force(cycle.faded[0].wall[0], sent - probes[0])

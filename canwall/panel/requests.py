@@ -145,7 +145,7 @@ def _request(change: WallChange) -> dict[str, Any]:
 def _as_change(wall: Wall) -> WallChange:
     """Return the change that leads to a wall from any other."""
     known = wall.model_dump(exclude_none=True)
-    if wall.damping_ratio is not None:
+    if wall.damping_ratio:
         del known["damping_nm_s_per_rad"]
     keys = set(WallChange.model_fields)
     return WallChange.model_validate({key: known[key] for key in known if key in keys})

@@ -32,18 +32,13 @@ def completed(changes: Sequence[WallChange], wall: Wall) -> list[dict[str, Any]]
         wall: The wall in force.
 
     Raises:
-        ConfigError: For keys that are not of a wall, and for a cap, where the wall has none: no
-            change takes it away again.
+        ConfigError: For keys that are not of a wall.
     """
     given = [change.model_dump(mode="json", exclude_none=True) for change in changes]
     keys = {key for one in given for key in one}
     if outside := sorted(keys - set(Wall.model_fields)):
         raise ConfigError(f"{outside[0]}: walls that are compared cannot differ in it; change it")
     known = wall.model_dump(mode="json")
-    if "cap" in keys and known["cap"] is None:
-        raise ConfigError(
-            "cap: the wall in force has none, and no change takes one away; give it one before"
-        )
     return [_completed(one, keys, known) for one in [*given, {}]]
 
 
@@ -57,7 +52,6 @@ def _completed(
         # Options that are not given belong to the law of the wall, and to no other.
         full.setdefault("options", known["options"] if "law" not in given else {})
     if keys & _DAMPING and not _DAMPING & set(given):
-        ratio = known["damping_ratio"] is not None
-        key = "damping_ratio" if ratio else "damping_nm_s_per_rad"
+        key = "damping_ratio" if known["damping_ratio"] else "damping_nm_s_per_rad"
         full[key] = known[key]
     return full

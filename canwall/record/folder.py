@@ -45,6 +45,11 @@ def reason(error: BaseException) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0]
 
 
+def unfinished(path: Path, writer: int) -> Path:
+    """Return the path at which a process with this ID writes a file before it is whole."""
+    return path.with_name(f".{path.name}.{writer}")
+
+
 @contextlib.contextmanager
 def whole_file(path: Path) -> Iterator[IO[bytes]]:
     """Write a file whole or not at all.
@@ -53,7 +58,7 @@ def whole_file(path: Path) -> Iterator[IO[bytes]]:
 
     Raises RecordError if it cannot be written.
     """
-    new = path.with_name(f".{path.name}.{os.getpid()}")
+    new = unfinished(path, os.getpid())
     try:
         new.unlink(missing_ok=True)
         with new.open("xb") as file:

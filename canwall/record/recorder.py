@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from canwall.record.folder import RecordError
+from canwall.record.folder import RecordError, RunFolder, unfinished
 from canwall.record.ring import Ring
 from canwall.record.target import Target
 
@@ -103,7 +103,12 @@ class Recorder:
         self._tell(draw=True)
         rows = int(self.ring.header["row_head"][0])
         error = self._answer(given_up, _TIMEOUT_S + _DRAWING_S * rows)
-        return [f"{self.folder}: the picture is missing: {error}"] if error else []
+        if not error:
+            return []
+        if self._writer.poll() is not None:
+            picture = RunFolder(self.folder).picture
+            unfinished(picture, self._writer.pid).unlink(missing_ok=True)
+        return [f"{self.folder}: the picture is missing: {error}"]
 
     def _tell(self, **order: Any) -> None:
         assert self._writer.stdin is not None
@@ -118,15 +123,19 @@ class Recorder:
         while not self._answers:
             if not self._says.poll(_LOOK_S * 1e3):
                 if given_up():
-                    self._writer.kill()
+                    self._kill_writer()
                     return "given up; `canwall plot` draws it"
                 if time.monotonic() < deadline:
                     continue
-                self._writer.kill()
+                self._kill_writer()
                 return "the writer of the record does not answer"
             if not self._listen():
                 return self._failure
         return self._answers.pop(0)
+
+    def _kill_writer(self) -> None:
+        self._writer.kill()
+        self._writer.wait()
 
     def _listen(self) -> bool:
         """Read what the writer says, which is waiting; return False if it has died."""

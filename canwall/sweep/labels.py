@@ -84,5 +84,5 @@ def shared_parameters(dataset: xr.Dataset) -> str:
 
 def _damping_ratio(dataset: xr.Dataset) -> float | None:
     """Return the damping ratio of the configuration, which stands in for a damping of 0."""
-    ratio: float | None = tomllib.loads(dataset.attrs["configuration"])["wall"].get("damping_ratio")
-    return ratio
+    ratio: float = tomllib.loads(dataset.attrs["configuration"])["wall"]["damping_ratio"]
+    return ratio or None

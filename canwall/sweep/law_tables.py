@@ -197,7 +197,7 @@ def _make_plans(
         **table.axes,
     }
     if not table.capped:
-        base = base.model_copy(update={"wall": base.wall.model_copy(update={"cap": None})})
+        base = base.model_copy(update={"wall": base.wall.model_copy(update={"cap": 0.0})})
     if table.draws:
         strikes = list(drawn_strikes(table.draws))
         plans = []
@@ -208,7 +208,7 @@ def _make_plans(
         return plans
     if not table.searches:
         return [make_plan(base, {"law": laws, **shared}, through)]
-    plain = {"damping_ratio": None, "damping_nm_s_per_rad": 0.0}
+    plain = {"damping_ratio": 0.0, "damping_nm_s_per_rad": 0.0}
     unknowing = base.model_copy(
         update={
             "wall": base.wall.model_copy(update=plain),

@@ -192,11 +192,11 @@ def _without_what_is_swept(
     That is a damping ratio where dampings are given, and a cap where the largest stiffness is
     searched.
     """
-    update: dict[str, None] = {}
+    update: dict[str, float] = {}
     if any(damping.values):
-        update["damping_ratio"] = None
+        update["damping_ratio"] = 0.0
     if stiffness is None:
-        update["cap"] = None
+        update["cap"] = 0.0
     return base.model_copy(update={"wall": base.wall.model_copy(update=update)})
 
 

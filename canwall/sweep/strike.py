@@ -270,10 +270,7 @@ class PreparedStrike:
         # Each wall fills in its own stiffness and damping.
         wall = settings.wall
         self._asked = AskedWall(
-            *(
-                np.full(self._cycles, value or 0.0)
-                for value in (None, None, wall.damping_ratio, wall.cap)
-            )
+            *(np.full(self._cycles, value) for value in (0.0, 0.0, wall.damping_ratio, wall.cap))
         )
         #: The referent is no stiffer than shaft, delay and encoder bear.
         self._stiffest = stiffest_for(self._loop.cycle, settings, self.mass)

@@ -75,6 +75,28 @@ def test_the_least_that_is_enough(loaded: Load) -> None:
     assert found.stages == [(0.0, Wall(), found.limits, Guard(), Operator())]
 
 
+@pytest.mark.parametrize(
+    ("wall", "law", "ratio", "cap"),
+    [
+        ({}, "mean_force", 0.5, 0.8),
+        ({"wall.damping_nm_s_per_rad": 0.0}, "mean_force", 0.0, 0.8),
+        ({"wall.damping_nm_s_per_rad": 0.1}, "mean_force", 0.0, 0.8),
+        ({"wall.damping_nm_s_per_rad": 0.0, "wall.damping_ratio": 0.7}, "mean_force", 0.7, 0.8),
+        ({"wall.law": "standard", "wall.cap": 0}, "standard", 0.5, 0.0),
+    ],
+)
+def test_a_wall_is_damped_and_capped_unless_it_is_said_otherwise(
+    loaded: Load, wall: dict[str, object], law: str, ratio: float, cap: float
+) -> None:
+    found = loaded(wall).wall
+    assert (found.law, found.damping_ratio, found.cap) == (law, ratio, cap)
+
+
+def test_defaults_of_a_wall_are_those_of_the_shipped_configuration() -> None:
+    shown, bare = load(shipped("config/sim.toml")).wall, Wall()
+    assert (bare.law, bare.damping_ratio, bare.cap) == (shown.law, shown.damping_ratio, shown.cap)
+
+
 REFUSED: list[tuple[dict[str, object], str]] = [
     # impossible values
     ({"bus.cycle_s": 0}, "bus.cycle_s: has to be greater than 0, not 0"),
@@ -491,7 +513,9 @@ def test_laws_take_turns_with_their_own_options(loaded: Load) -> None:
     ("values", "embedded", "real_time"),
     [
         ({}, False, True),
-        ({"simulation": {}}, True, False),
+        ({"simulation": {}, "run.duration_s": 1}, True, False),
+        ({"simulation": {}}, True, True),  # without an end
+        ({"simulation": {}, "bus.pace": "simulated"}, True, False),
         ({"simulation": {}, "bus.pace": "real_time"}, True, True),
         ({"simulation": {}, "bus.interface": "unixcan"}, False, False),
         ({"bus.pace": "simulated"}, False, False),

@@ -13,6 +13,7 @@ from canwall.config import Mechanics, Settings
 from canwall.cycle.delay import Delay, agreed_delay, excitation, measured_delay
 from canwall.physics import zoh
 from canwall.record import Phase
+from canwall.walls import MAX_DELAY
 
 COUNT = 2.0 * np.pi / 131072
 PERIOD = 1e-3
@@ -159,7 +160,7 @@ def test_loop_measures_the_delay_that_the_drive_was_given(
     assert loop.axis.delay > given - 1e-3
     rows = loop.rows()
     measuring = rows[rows["phase"] == Phase.MEASURING]
-    assert len(measuring) == 850
+    assert len(measuring) == 850 + MAX_DELAY + 1
     assert np.ptp(measuring["position_rad"]) < 0.05
 
 

@@ -15,9 +15,10 @@ from canwall import config
 from canwall.analysis.felt import band_rms, felt_band
 from canwall.cli.run import _strike_table
 from canwall.config import Settings
-from canwall.record import ROW
+from canwall.record import ROW, Phase, read_signals
 from canwall.record.columns import record_batch
 from canwall.record.pictures import draw_run
+from canwall.run import run
 from canwall.run.closed_loop import SIGNALS, ClosedLoop, simulate, simulate_loop
 from canwall.run.result import judged
 from canwall.sweep.axes import settings_at
@@ -91,6 +92,24 @@ def unknown() -> tuple[pa.Table, dict[str, Any]]:
     found = simulate(settings, round(settings.run.duration_s / settings.bus.cycle_s))
     table = pa.Table.from_batches([record_batch(found.rows, ["mean_force"])])
     return table, judged(table, settings, found.units)
+
+
+def test_measurement_of_the_delay_is_no_contact(tmp_path: Path) -> None:
+    settings = settings_with({"estimator.measure_delay": True, "run.duration_s": 2.0})
+    assert settings.simulation is not None
+    hand = settings.simulation.hand.model_copy(update={"strikes": 1, "first_strike_s": 1.1})
+    simulation = settings.simulation.model_copy(update={"hand": hand})
+    settings = settings.model_copy(update={"simulation": simulation})
+    result = run(settings, tmp_path / "run")
+    (strike,) = result.summary["strikes"]
+    assert 1.1 < strike["start_s"] < 1.2
+    assert result.summary["contacts"] == strike["contacts"]
+    signals = read_signals(result.folder.signals)
+    measures = signals["phase"].to_numpy() == Phase.MEASURING
+    assert np.ptp(signals["torque_cmd"].to_numpy()[measures]) > 0.01
+    before = signals["t_s"].to_numpy() < 1.1
+    assert not signals["force_applied"].to_numpy()[before].any()
+    assert not signals["torque_applied"].to_numpy()[before & ~measures].any()
 
 
 def test_lost_rows_do_not_shift_times_and_referent() -> None:

@@ -535,6 +535,7 @@ def test_signals_at_every_call_until_all_is_told(tmp_path: Path, noisy: str) -> 
     assert "Traceback" not in done.stderr
     assert done.returncode in (1, 130)
     assert "the picture is missing: given up" in done.stderr
+    assert not list(folder.glob(".*"))
     assert f"record: {folder}" in done.stdout
     for trip in record.summary["trips"]:
         assert trip in done.stderr

@@ -161,9 +161,9 @@ export class Controls {
     const { wall } = this.#settings;
     const change = {
       law: wall.law, deadbeat: wall.deadbeat, options: wall.options, position_rad: wall.position_rad,
-      stiffness_nm_per_rad: wall.stiffness_nm_per_rad, tension: wall.tension,
+      stiffness_nm_per_rad: wall.stiffness_nm_per_rad, cap: wall.cap, tension: wall.tension,
     };
-    if (known(wall.damping_ratio)) change.damping_ratio = wall.damping_ratio;
+    if (wall.damping_ratio) change.damping_ratio = wall.damping_ratio;
     else change.damping_nm_s_per_rad = wall.damping_nm_s_per_rad;
     return change;
   }
@@ -277,9 +277,9 @@ export class Controls {
     if (!this.#settings) return;
     const { wall, guard, operator } = this.#settings;
     if (known(wall.stiffness_nm_per_rad)) this.#showStiffness(wall.stiffness_nm_per_rad);
-    const kind = known(wall.damping_ratio) ? "ratio" : "value";
+    const kind = wall.damping_ratio ? "ratio" : "value";
     for (const radio of document.getElementsByName("damping-kind")) radio.checked = radio.value === kind;
-    this.#showDamping(wall.damping_ratio ?? wall.damping_nm_s_per_rad);
+    this.#showDamping(wall.damping_ratio || wall.damping_nm_s_per_rad);
     this.#showPosition(1e3 * wall.position_rad);
     for (const radio of document.getElementsByName("tension")) radio.checked = radio.value === wall.tension;
     for (const radio of document.getElementsByName("guard")) radio.checked = radio.value === guard?.action;
@@ -400,6 +400,6 @@ export function wording(change) {
   return [
     law?.replaceAll("_", " "),
     known(stiffness) && `${digits(stiffness)} N·m/rad`,
-    known(ratio) ? `ζ ${digits(ratio, 2)}` : known(damping) && `${digits(damping, 2)} N·m·s/rad`,
+    ratio ? `ζ ${digits(ratio, 2)}` : known(damping) && `${digits(damping, 2)} N·m·s/rad`,
   ].filter(Boolean).join(", ") || "another setting";
 }
