@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[1]
 CONFIG = ROOT / "config" / "sim.toml"
 PAGES = (ROOT / "README.md", ROOT / "docs" / "results.md")
 #: Laws of the short table in README.md.
-SHORT = ("standard", "damped", "half_sample", "mean_force")
+SHORT = ("standard", "damped", "half_sample", "mean_force", "push_only")
 END = "<!-- end of table -->"
 
 
