@@ -70,22 +70,25 @@ def fit_servo(position: Array, torque: Array, period: float, step: float) -> Ser
     first, sign = steady_pieces(position, period, step)
     _check_amount(first, sign)
 
-    def fit(some: slice | NDArray[np.bool_], ringing: tuple[float, float] | None = None) -> _Fit:
-        return _Fit(position, torque, period, step, first[some], sign[some], ringing)
+    ringing: tuple[float, float] | None = None
+    viscous = 0.0
+
+    def fit(some: slice | NDArray[np.bool_]) -> _Fit:
+        return _Fit(position, torque, period, step, first[some], sign[some], ringing, viscous)
 
     # A part of the pieces is enough for first values.
     part = fit(slice(None, None, 3))
     x = part.rigid()
     shaft = part.elastic(x)
     if shaft is not None:
-        x = shaft
-    ringing = None if shaft is None else (float(x[2]), float(x[3]))
-    whole = fit(slice(None), ringing)
+        x, ringing = shaft, (float(shaft[2]), float(shaft[3]))
+        viscous = part.viscous(x)
+    whole = fit(slice(None))
     x = whole.refined(x)
     sound = whole.sound(x)
     if not sound.all():
         _check_amount(first[sound], sign[sound])
-        whole = fit(sound, ringing)
+        whole = fit(sound)
         x = whole.refined(x)
     found = whole.result(x, 1.0 - float(np.mean(sound)))
     _check_told(found)
@@ -124,9 +127,10 @@ class _Fit:
         step: float,
         first: NDArray[np.int64],
         sign: Array,
-        ringing: tuple[float, float] | None = None,
+        ringing: tuple[float, float] | None,
+        viscous: float,
     ) -> None:
-        self._pieces = Pieces(position, torque, period, first, ringing)
+        self._pieces = Pieces(position, torque, period, first, ringing, viscous)
         self._position, self._period, self._step = position, period, step
         self._first, self._sign = first, sign
         pieces = self._pieces
@@ -286,6 +290,11 @@ class _Fit:
         meat = sums.T @ sums * _BLOCKS / (_BLOCKS - 1.0)
         covariance = bread @ meat @ bread
         return linear, covariance / np.outer(scale, scale), left[:samples]
+
+    def viscous(self, x: Array) -> float:
+        """Return the viscous friction [N·m·s/rad]."""
+        linear = self._everything(x)[0]
+        return max(float(linear[2 if len(x) > 2 else 1] / linear[0]), 0.0)
 
     def result(self, x: Array, left_out: float) -> ServoFit:
         """Return the fit in physical units."""

@@ -119,6 +119,7 @@ class Pieces:
     """Regressors of the pieces: integrals of what acts, without what their beginnings explain.
 
     `ringing` is frequency [Hz] and damping ratio of a shaft: friction that reverses makes it ring.
+    `viscous` is friction of its rotor [N·m·s/rad], which drives the resonance as the torque does.
     """
 
     def __init__(
@@ -128,8 +129,11 @@ class Pieces:
         period: float,
         first: NDArray[np.int64],
         ringing: tuple[float, float] | None,
+        viscous: float,
     ) -> None:
         self.torque, self.period = torque, period
+        velocity = np.nan_to_num(np.diff(position, append=position[-1])) / period
+        self._braking = viscous * velocity
         self.at = first[:, None] + np.arange(PIECE)
         self._position = position[self.at]
         time = np.arange(PIECE) * period
@@ -182,5 +186,9 @@ class Pieces:
 
     def driven(self, delay: float, lag: float, hz: float, damping_ratio: float) -> Array:
         """Return the regressors of 1/m and ρ/m, shape (samples, 2)."""
-        motion = torque_response(self.torque, self.period, delay, lag, hz, damping_ratio)[self.at]
+        motion = torque_response(self.torque, self.period, delay, lag, hz, damping_ratio)
+        if self._braking.any():
+            braked = torque_response(self._braking, self.period, 0.0, 0.0, hz, damping_ratio)
+            motion[:, 1] -= braked[:, 1]
+        motion = motion[self.at]
         return np.stack([self.flat(motion[:, :, k] - motion[:, :1, k]) for k in (0, 1)], axis=1)

@@ -136,9 +136,9 @@ def test_small_rotor_of_a_heavy_handle(hz: float, ratio: float) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [4, 24])
+@pytest.mark.parametrize("seed", [4, 24, 22])
 def test_random_servo(seed: int) -> None:
-    """Two of the thirty: a stiff shaft and an elastic one."""
+    """Three of the thirty: a stiff shaft, an elastic one, and one whose rotor is braked."""
     truth, fit = identified(seed)
     for name, (estimate, true) in compared(truth, fit).items():
         assert error(name, estimate, true) <= AIMS[name], name
@@ -151,6 +151,7 @@ def test_random_servo(seed: int) -> None:
         assert mechanics["shaft_hz"] == pytest.approx(truth.shaft_hz, rel=0.05)
         rotor = truth.rotor_part * mechanics["inertia_kg_m2"]
         assert mechanics["rotor_inertia_kg_m2"] == pytest.approx(rotor, rel=0.1)
+        assert mechanics["shaft_damping_ratio"] == pytest.approx(truth.shaft_damping, rel=0.1)
 
 
 @pytest.mark.slow
