@@ -21,7 +21,7 @@ def read(path: str | os.PathLike[str]) -> "RecordedRun | xr.Dataset":
 
     Raises:
         canwall.errors.InputError: If there is neither, or it is damaged.
-        canwall.errors.RecordError: If the folder of a run that was cut off cannot be completed.
+        canwall.errors.RunFailedError: If the folder of a run that was cut off cannot be completed.
     """
     path = Path(path)
     if path.suffix == ".nc":

@@ -100,7 +100,7 @@ class RecordedRun:
         The first line has names and, in brackets, units.
 
         Raises:
-            canwall.errors.RecordError: If a file cannot be written.
+            canwall.errors.RunFailedError: If a file cannot be written.
         """
         from canwall.library.export import write_csv
 
@@ -113,7 +113,7 @@ class RecordedRun:
         which `signals.law` is an index from 1; `summary`; and `config`, the configuration as text.
 
         Raises:
-            canwall.errors.RecordError: If the file cannot be written.
+            canwall.errors.RunFailedError: If the file cannot be written.
         """
         from canwall.library.export import write_mat
 
