@@ -219,6 +219,7 @@ def make_cycle(settings: Settings, setup: DriveSetup, laws: Sequence[Law]) -> ND
         masses, dampings = _hands(settings)
         mass, viscous = masses[0], dampings[0]
     set_plant(cycle["rendered"][0]["wall"][0], mass, viscous, spring, period)
+    cycle["rendered"]["wall"]["device_viscous"] = settings.mechanics.viscous_nm_s_per_rad
     cycle["rendered"]["law"] = NO_LAW
     set_wall(cycle, settings.wall, laws)
     return cycle
@@ -447,7 +448,9 @@ def set_wall(cycle: NDArray[np.void], wall: Wall, laws: Sequence[Law]) -> None:
         # The law's torques are held until it is evaluated again.
         rendered["divider"] = rendered["waited"] = wall.divider
         mass, viscous, spring = (known[name].item() for name in ("mass", "viscous", "spring"))
+        device = known["device_viscous"].item()
         set_plant(known, mass, viscous, spring, cycle["period"].item() * wall.divider)
+        known["device_viscous"] = device
     set_referent(known, wall.stiffness_nm_per_rad, wall.damping_nm_s_per_rad, options)
     known["damping_ratio"], known["cap"] = wall.damping_ratio, wall.cap
     known["tension"] = TENSION[wall.tension]

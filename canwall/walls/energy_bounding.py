@@ -19,7 +19,7 @@ import math
 from canwall.compiled import Record, compiled
 from canwall.walls.interface import sampled_law
 
-#: damping: that of the device, 0: of the model; delay: periods from a sample to its force, 0: that
+#: damping: that of the device, 0: as configured; delay: periods from a sample to its force, 0: that
 #: of the paper.
 OPTIONS = {"damping": 0.0, "delay": 1.0}
 
@@ -40,7 +40,7 @@ def energy_bounding(wall: Record) -> float:
     memory = wall.memory
     moved = wall.y_sample - memory[_BEFORE] if memory[_BEGUN] else 0.0
     memory[_BEFORE], memory[_BEGUN] = wall.y_sample, 1.0
-    device = wall.options.damping if wall.options.damping > 0.0 else wall.viscous
+    device = wall.options.damping if wall.options.damping > 0.0 else wall.device_viscous
     taken, delay = device / wall.period, wall.options.delay
     c1 = min(wall.stiffness, 2.0 * taken / (1.0 + 2.0 * delay))
     bound = largest_force(memory[_FORCE], moved, c1, taken - delay * c1)

@@ -69,6 +69,8 @@ WALL = np.dtype(
         # Where there is a cap: the largest stiffness that shaft, delay and encoder bear with the
         # mass in force.
         ("stiffest", "f8"),
+        # Viscous damping of the device alone: no hand that is identified changes it.
+        ("device_viscous", "f8"),
         # The law's options, in the order in which its file declares them.
         ("option_values", "f8", (MAX_OPTIONS,)),
     ],
@@ -212,7 +214,7 @@ def set_plant(
     for name, value in (("mass", mass), ("viscous", viscous), ("spring", spring)):
         wall[name] = value
         wall["referent"][name] = value
-    wall["period"] = period
+    wall["device_viscous"], wall["period"] = viscous, period
     wall["phi"], wall["gamma"] = zoh(mass, viscous, spring, period)
 
 

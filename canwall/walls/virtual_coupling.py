@@ -7,7 +7,7 @@ The tool has no mass, and is integrated implicitly (backward Euler), which keeps
 largest stiffness that is felt is K_c.
 
 By default the coupling is the stiffest that is passive with any operator, for the damping b of the
-model. Without delay that is b > K_c·T/2 + B_c, so K_c = 2·b/T and B_c = 0; with a delay of D = 1,
+device. Without delay that is b > K_c·T/2 + B_c, so K_c = 2·b/T and B_c = 0; with a delay of D = 1,
 b > 1.5·K_c·T − B_c up to K_c·T = 4·B_c (docs/laws.md), so K_c = 0.8·b/T and B_c = b/5.
 """
 
@@ -39,7 +39,7 @@ def virtual_coupling(wall: Record) -> float:
         memory[_BEGUN] = 1.0
     stiffness, damping = wall.options.stiffness, wall.options.damping
     if stiffness <= 0.0 and damping <= 0.0:
-        stiffness, damping = passive_coupling(wall.viscous, period, wall.options.delay)
+        stiffness, damping = passive_coupling(wall.device_viscous, period, wall.options.delay)
     # The tool's balance, K·y_t + B·ẏ_t + K_c·(y_t − y) + B_c·(ẏ_t − ẏ) = 0, with backward
     # differences; without the wall where that leaves it outside.
     lag = damping / period

@@ -50,6 +50,19 @@ def assert_same(bus: NDArray[np.void], memory: NDArray[np.void]) -> None:
         assert not len(differs), f"{name} from cycle {differs[0] + 1} on"
 
 
+@pytest.mark.parametrize("law", ["energy_bounding", "virtual_coupling"])
+def test_hand_that_is_identified_adds_no_damping_to_the_device(law: str) -> None:
+    viscous = 0.01
+    keys = {f"{section}.viscous_nm_s_per_rad": viscous for section in ("mechanics", "simulation")}
+    keys |= {"wall.law": law, "wall.stiffness_nm_per_rad": 200.0}
+    settings = strikes(keys | {"operator.adapt": True, "mechanics.inertia_kg_m2": 1e-4})
+    rows = simulate(settings, 1_500).rows
+    assert rows["mass_est"].max() > 1.5e-4
+    deep = rows[rows["y"] < -0.01]
+    # The stiffest passive coupling, and some more for what a wall's own damper adds.
+    assert np.all(deep["force"] < 1.2 * 0.8 * viscous / settings.bus.cycle_s * -deep["y"])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS)
 def test_every_law_comes_to_the_same_bits(make_rig: RigFactory, law: str) -> None:
