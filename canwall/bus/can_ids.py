@@ -14,4 +14,4 @@ LSS_RESPONSE = 0x7E4
 LSS_REQUEST = 0x7E5
 
 #: All PDOs of the predefined connection set, of every node.
-PDOS = range(0x180, 0x580)
+PDOS = range(TPDO1, SDO_RESPONSE)

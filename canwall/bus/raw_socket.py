@@ -60,7 +60,7 @@ FRAME, NOTHING, CLOSED, FAILED = 1, 0, -1, -2
 #: of the retries, since no poll reports room. A queue of ten frames empties in 11 ms at 125 kbit/s.
 QUEUE_PATIENCE_NS, QUEUE_RETRY_NS = 50_000_000, 200_000
 
-_CLOCK_REALTIME, _CLOCK_MONOTONIC, _TIMER_ABSTIME = 0, 1, 1
+_CLOCK_MONOTONIC, _TIMER_ABSTIME = 1, 1
 _POLLIN, _POLLOUT = 1, 4
 _NS_PER_S = 1_000_000_000
 _EAGAIN, _EINTR, _ECONNRESET = errno.EAGAIN, errno.EINTR, errno.ECONNRESET
@@ -134,13 +134,6 @@ def _errno() -> int:
 def now_ns(port: Record) -> int:
     """CLOCK_MONOTONIC [ns], which is also time.perf_counter_ns."""
     _clock_gettime(_CLOCK_MONOTONIC, port.timespec.ctypes.data)
-    return port.timespec[0] * _NS_PER_S + port.timespec[1]
-
-
-@compiled
-def wall_clock_ns(port: Record) -> int:
-    """CLOCK_REALTIME [ns], which is that of the kernel's time stamps and of time.time."""
-    _clock_gettime(_CLOCK_REALTIME, port.timespec.ctypes.data)
     return port.timespec[0] * _NS_PER_S + port.timespec[1]
 
 

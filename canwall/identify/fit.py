@@ -132,7 +132,7 @@ class _Fit:
     ) -> None:
         self._pieces = Pieces(position, torque, period, first, ringing, viscous)
         self._position, self._period, self._step = position, period, step
-        self._first, self._sign = first, sign
+        self._first = first
         pieces = self._pieces
         self._measured = pieces.measured()
         seen = position[pieces.at]

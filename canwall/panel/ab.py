@@ -1,14 +1,13 @@
 """A and B: two walls, one key to switch between them, or a turn for each from strike to strike."""
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 from canwall.config import ConfigError, Wall
 from canwall.panel.walls import completed, parse_change
 
 #: Makes a request of the run and returns the cycle from which on it is in force.
 Request = Callable[[dict[str, Any]], int]
-Which = Literal["a", "b"]
 
 
 class AB:

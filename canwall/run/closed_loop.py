@@ -47,7 +47,7 @@ _TPDO = PdoLayout(
 )
 _RPDO = PdoLayout(0, (Field(od.TARGET_TORQUE, 0, 0, 16),))
 _ENABLED = DriveState.OPERATION_ENABLED.value[1]
-_ENABLING, _RENDERING = int(Phase.ENABLING), int(Phase.RENDERING)
+_RENDERING = int(Phase.RENDERING)
 #: N·m per mN·m and per mille.
 _PER_MILLE_MILLI = 1e-6
 
