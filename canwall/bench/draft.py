@@ -6,7 +6,8 @@ from typing import Any
 
 import tomli_w
 
-from canwall.bench.soft_wall import HANDLE_M, TORQUE_PART, WORST_DELAY, soft_stiffness, soft_torque
+from canwall.analysis.felt import HANDLE_RADIUS_M
+from canwall.bench.soft_wall import TORQUE_PART, WORST_DELAY, soft_stiffness, soft_torque
 from canwall.config import Bus as BusSettings
 from canwall.config import Drive as DriveSettings
 from canwall.drive import REQUIRED_OBJECTS, DriveNode, Link
@@ -124,7 +125,7 @@ law = "mean_force"
 side = "below"                 # the wall fills positions below (or "above")
 # A tenth of K = (b + b_h)/(T/2 + D·T), up to which the plain wall (standard) is stable, at the
 # worst delay, D = {WORST_DELAY} periods, in the lightest hand: b = 0, and b_h is that of a
-# fingertip, 2 N·s/m at a handle of {HANDLE_M * 1e3:.0f} mm. No law chatters in any hand;
+# fingertip, 2 N·s/m at a handle of {HANDLE_RADIUS_M * 1e3:.0f} mm. No law chatters in any hand;
 # raise it step by step.
 stiffness_nm_per_rad = {stiffness}
 damping_ratio = 0.5

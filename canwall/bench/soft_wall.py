@@ -3,6 +3,7 @@
 import math
 
 from canwall.analysis.analytic_limits import stable_stiffness
+from canwall.analysis.felt import handle_radius
 from canwall.config import Mechanics
 
 #: Part of the rated torque that is the first limit.
@@ -10,8 +11,6 @@ TORQUE_PART = 0.1
 #: Delay that is reckoned with [periods]: one by the bus, and at most one more by the drive's own
 #: cycle and current loop.
 WORST_DELAY = 2
-#: Radius of the handle [m], where it is not known.
-HANDLE_M = 0.08
 #: The lightest hand, a fingertip: mass [kg] and damping [N·s/m].
 _FINGERTIP_KG, _FINGERTIP_N_S_PER_M = 0.004, 2.0
 #: Part of the stability limit. Of all laws `exponential` is the stiffest at a depth, and was found
@@ -19,33 +18,26 @@ _FINGERTIP_KG, _FINGERTIP_N_S_PER_M = 0.004, 2.0
 _PART = 0.1
 
 
-def soft_stiffness(
-    inertia_kg_m2: float, viscous_nm_s_per_rad: float, cycle_s: float, radius_m: float = HANDLE_M
-) -> float:
+def soft_stiffness(inertia_kg_m2: float, viscous_nm_s_per_rad: float, cycle_s: float) -> float:
     """Return a stiffness at which no law chatters in any hand [N·m/rad].
 
     A tenth of the stability limit of the law `standard` at the worst delay and in the lightest
     hand, which is (b + b_h)/(T/2 + D·T) for small (b + b_h)·T/m (Gil, Hulin), rounded down to a
-    figure of one digit.
+    figure of one digit. The handle is one of HANDLE_RADIUS_M.
 
     Args:
         inertia_kg_m2: Inertia of drive and handle.
         viscous_nm_s_per_rad: Their viscous friction b.
         cycle_s: Period T of the SYNC.
-        radius_m: Radius of the handle, at which the fingertip has its damping b_h.
     """
-    mechanics = Mechanics(
-        inertia_kg_m2=inertia_kg_m2,
-        viscous_nm_s_per_rad=viscous_nm_s_per_rad,
-        handle_radius_m=radius_m,
-    )
+    mechanics = Mechanics(inertia_kg_m2=inertia_kg_m2, viscous_nm_s_per_rad=viscous_nm_s_per_rad)
     limit = stable_stiffness(*with_fingertip(mechanics), 0.0, cycle_s, WORST_DELAY)
     return rounded_down(_PART * limit, 1)
 
 
 def with_fingertip(mechanics: Mechanics) -> tuple[float, float]:
     """Return inertia [kg·m²] and damping [N·m·s/rad] of drive and handle in the lightest hand."""
-    radius = mechanics.handle_radius_m or HANDLE_M
+    radius = handle_radius(mechanics.handle_radius_m)
     return (
         mechanics.inertia_kg_m2 + _FINGERTIP_KG * radius**2,
         mechanics.viscous_nm_s_per_rad + _FINGERTIP_N_S_PER_M * radius**2,
