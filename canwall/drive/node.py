@@ -119,9 +119,9 @@ class DriveNode:
         signed = variable is not None and variable.data_type in datatypes.SIGNED_TYPES
         return int.from_bytes(raw, "little", signed=signed)
 
-    def read_text(self, index: int, subindex: int = 0) -> str:
+    def read_text(self, index: int) -> str:
         """Read a VISIBLE_STRING, "?" for what is not visible. Raises DriveError."""
-        text = self._upload(index, subindex).decode("latin-1").rstrip("\0 ")
+        text = self._upload(index, 0).decode("latin-1").rstrip("\0 ")
         return "".join(c if c.isprintable() else "?" for c in text)
 
     def write(self, index: int, subindex: int, value: int, size: int | None = None) -> None:

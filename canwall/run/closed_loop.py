@@ -159,7 +159,6 @@ class LoopRecords(NamedTuple):
 def simulate(
     settings: Settings,
     cycles: int,
-    enabling: int = ENABLING_CYCLES,
     disturbances: Disturbances | None = None,
 ) -> SimulatedRun:
     """Render the wall of a configuration in memory.
@@ -170,13 +169,12 @@ def simulate(
     Args:
         settings: Configuration with `[simulation]`, without changes of the wall.
         cycles: Number of SYNCs.
-        enabling: Number of SYNCs without torque at the start.
         disturbances: What bus and master do. Default: nothing.
 
     Raises:
         ConfigError: If only a run can render the configuration.
     """
-    loop = ClosedLoop(settings, cycles, enabling, disturbances)
+    loop = ClosedLoop(settings, cycles, disturbances=disturbances)
     records, rows, signals = loop.records(), np.zeros(cycles, ROW), np.empty((SIGNALS, cycles))
     done = simulate_loop(records, rows, signals)
     trip = Trip(int(records.cycle["trip"][0]))
@@ -202,7 +200,7 @@ class ClosedLoop:
         enabling: int = ENABLING_CYCLES,
         disturbances: Disturbances | None = None,
     ) -> None:
-        """Prepare a loop; arguments and errors are those of `simulate`."""
+        """Prepare a loop as `simulate` does, with `enabling` SYNCs without torque at the start."""
         simulation = settings.simulation
         if simulation is None:
             raise ConfigError("[simulation] is missing: there is no drive to simulate")

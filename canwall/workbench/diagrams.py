@@ -20,10 +20,9 @@ Point = tuple[float, float]
 class _Canvas:
     """Axes without ticks, a unit of which is as wide as it is high."""
 
-    def __init__(self, width: float, height: float, inches: float = PAGE_IN) -> None:
-        self.figure = Figure(
-            figsize=(inches, inches * height / width), layout="constrained", dpi=DPI
-        )
+    def __init__(self, width: float, height: float) -> None:
+        size = (PAGE_IN, PAGE_IN * height / width)
+        self.figure = Figure(figsize=size, layout="constrained", dpi=DPI)
         self.axes: Axes = self.figure.add_subplot()
         self.axes.set(xlim=(0.0, width), ylim=(0.0, height), aspect="equal")
         self.axes.axis("off")
@@ -70,8 +69,9 @@ class _Canvas:
         self.line((x, y - 0.38), (x, y + 0.38), lw=0.6, color="0.5")
         self.line((x - 0.42, y - 0.36), (x, y), (x + 0.45, y), lw=1.8)
 
-    def spring(self, bottom: Point, top: float, turns: int = 5, **style: object) -> None:
+    def spring(self, bottom: Point, top: float, **style: object) -> None:
         """Draw a spring upwards from a point."""
+        turns = 5
         x, low = bottom
         lead = 0.12 * (top - low)
         inner = np.linspace(low + lead, top - lead, 2 * turns + 2)
