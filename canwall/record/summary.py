@@ -60,7 +60,7 @@ def summarise(
     chattering = [s for s in strikes if s["chatter"]]
     torque = numbers(signals, "torque_cmd")
     return {
-        "law": list(dict.fromkeys(stage.wall.law for stage in settings.stages)),
+        "law": laws.unique().to_pylist(),
         "stiffness": settings.wall.stiffness_nm_per_rad,
         "damping": settings.wall.damping_nm_s_per_rad,
         "damping_ratio": settings.wall.damping_ratio or None,

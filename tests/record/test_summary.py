@@ -15,6 +15,7 @@ from canwall.units import DriveUnits
 
 PERIOD_S, COUNT, STEP_NM, RADIUS_M = 0.001, 1e-6, 1e-6, 0.08
 UNITS = DriveUnits(2.0 * math.pi / COUNT, 1000.0 * STEP_NM)
+LAWS = ["standard", "midpoint", "half_sample+deadbeat"]
 IN, DEEP, REST, OUT, END = 20, 60, 100, 900, 1000
 DEPTH, FIRST_DEPTH, AMPLITUDE, FREQUENCY_HZ = 0.01, 0.04, 0.002, 25.0
 
@@ -45,8 +46,14 @@ def summary_of(y: np.ndarray, force: np.ndarray, **columns: Any) -> dict[str, An
         rows[name] = values
     settings = settings_with({"mechanics.handle_radius_m": RADIUS_M})
     assert settings.bus.cycle_s == PERIOD_S
-    table = pa.Table.from_batches([record_batch(rows, ["standard"])])
+    table = pa.Table.from_batches([record_batch(rows, LAWS)])
     return summarise(table, settings, UNITS, pressed(), np.zeros(len(y)))
+
+
+def test_laws_are_those_that_were_used_in_that_order() -> None:
+    y = pressed()
+    law = np.where(np.arange(END) < DEEP, 2, 0)
+    assert summary_of(y, np.zeros(END), law=law)["law"] == ["half_sample+deadbeat", "standard"]
 
 
 def test_chatter_is_that_of_the_settled_part() -> None:
