@@ -120,7 +120,11 @@ def _settings(settings: Settings, request: Start) -> Settings:
         from canwall.cycle.state import MAX_LAWS
         from canwall.walls import DEADBEAT, LAWS
 
-        known = dict.fromkeys(stage.wall.law for stage in settings.stages)
+        known = {
+            wall.law + (DEADBEAT if wall.deadbeat else ""): None
+            for stage in settings.stages
+            for wall in settings.laws_in_turn(stage.wall)
+        }
         known |= dict.fromkeys(settings.run.more_laws)
         known |= dict.fromkeys(name for name in LAWS if not name.endswith(DEADBEAT))
         raw["run"] |= {"duration_s": None, "more_laws": tuple(known)[:MAX_LAWS]}

@@ -16,10 +16,13 @@ import httpx2
 import numpy as np
 import pytest
 from fake_run import CYCLE_S, FakeRun, PanelBeside, rows_of, wait_until
+from rig import settings_with
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
+from canwall import config
 from canwall.analysis import metrics
+from canwall.cycle.state import MAX_LAWS
 from canwall.panel import follower, session
 from canwall.panel import server as panel_server
 from canwall.panel.launch import Launcher, StartedRun
@@ -326,6 +329,18 @@ def test_two_starts_at_once_start_one_run(
         process.kill()
     assert str(refused) == "a run is in progress; end it first"
     assert len(runs) == 1
+
+
+def test_start_announces_no_more_laws_than_a_run_takes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("subprocess.Popen", lambda *_, **__: None)
+    given = settings_with({"wall.law": "half_sample", "wall.deadbeat": True})
+    (tmp_path / "mine.toml").write_text(given.to_toml(), encoding="utf-8")
+    run = Launcher(tmp_path, tmp_path / "mine.toml").start(Start())
+    laws = config.load(run.folder / "start.toml").run.more_laws
+    assert "half_sample+deadbeat" in laws
+    assert len(laws) == MAX_LAWS
 
 
 def test_control(page: PageOf, run: FakeRun, open_page: Callable[[], PageOf]) -> None:
