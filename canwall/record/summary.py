@@ -46,7 +46,9 @@ def summarise(
     y, force = numbers(signals, "y"), numbers(signals, "force_applied")
     stiffness, laws = numbers(signals, "stiffness"), signals["law"]
     rendering = numbers(signals, "phase") == Phase.RENDERING
-    work = metrics.energy_out(y, force)
+    # A wall that moves, to which y is relative, is no motion of the handle.
+    handle = y + settings.wall.orientation * numbers(signals, "wall_position_rad")
+    work = metrics.energy_out(handle, force)
     touched = metrics.contacts(np.where(rendering, y, np.inf), force)
     names = ("stiffness_in_force", "mass_est", "mass_spread", "delay_est")
     in_force = {name: numbers(signals, name) for name in names}
@@ -109,18 +111,20 @@ def _strike(
     )
     running = work[cycles] - work[start]
     energy_tolerance = units.rad_per_count * float(np.abs(force[cycles]).max(initial=0.0))
+    seen = cycles
     if referent is None or referent_felt is None:
         ripple, judged = _ripple_of_contact(strike, force, settings)
     else:
-        rest, first, last = metrics.settled_window(referent[cycles], tolerance, period)
-        windows = (rest + start, first + start, last + start)
+        seen = slice(_last_outside(y, referent, start, units.rad_per_count), cycles.stop)
+        rest, first, last = metrics.settled_window(referent[seen], tolerance, period)
+        windows = (rest + seen.start, first + seen.start, last + seen.start)
         judged = slice(*windows[1:])
         ripple = metrics.Ripple(
             _felt(force, *windows, settings), _felt(referent_felt, *windows, settings), _SOURCE
         )
     verdict = metrics.chatter(
-        inside,
-        None if referent is None else referent[cycles],
+        y[seen],
+        None if referent is None else referent[seen],
         period,
         tolerance,
         units.rad_per_count,
@@ -158,6 +162,16 @@ def _strike(
         "chatter_amplitude_rad": amplitude,
         "chatter_frequency_hz": frequency,
     }
+
+
+def _last_outside(y: Array, referent: Array, start: int, count: float) -> int:
+    """Return the last cycle up to the start of a strike in which wall and referent are not touched.
+
+    From there on both make contact, also if the wall acts ahead of its surface.
+    """
+    begin = max(start - 2 * SPAN, 0)
+    outside = np.flatnonzero(np.minimum(y, referent)[begin : start + 1] > count)
+    return begin + int(outside[-1]) if len(outside) else start
 
 
 def _in_force(
