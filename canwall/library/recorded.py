@@ -57,7 +57,7 @@ class RecordedRun:
 
     @cached_property
     def strikes(self) -> "pd.DataFrame":
-        """The strikes on the wall, a row each; units are in the names of the columns."""
+        """The strikes on the wall, a row each, in SI units (docs/formats.md)."""
         need("sweep")
         import pandas as pd
 
@@ -97,7 +97,7 @@ class RecordedRun:
     def to_csv(self) -> list[Path]:
         """Write signals.csv and strikes.csv into the folder, for a spreadsheet; return their paths.
 
-        The first line has names and, in brackets, units.
+        The first line has names, and for the signals, in brackets, units.
 
         Raises:
             canwall.errors.RunFailedError: If a file cannot be written.

@@ -78,6 +78,9 @@ def sweep(
         "rate": rate,
         "operator": operator,
     }
+    for name in axes or {}:
+        if given.get(name) is not None:
+            raise InputError(f"sweep axis {name}: is given twice; keep one")
     given |= axes or {}
     plan = make_plan(
         settings, {name: _plain(v) for name, v in given.items() if v is not None}, through

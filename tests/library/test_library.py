@@ -363,6 +363,8 @@ def test_law_that_others_cannot_have_is_refused() -> None:
         canwall.sweep(law="spring", through="bus", progress=False)
     with pytest.raises(InputError, match="give the output of the sweep"):
         canwall.sweep(resume=True)
+    with pytest.raises(InputError, match="sweep axis stiffness: is given twice"):
+        canwall.sweep(None, {"stiffness": 20.0}, stiffness=10.0)
 
 
 def test_ball_falls_and_has_units() -> None:
