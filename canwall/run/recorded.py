@@ -67,6 +67,7 @@ def read_run(
         raise ConfigError(f"{folder.path}: no cycle was recorded")
     summary = _summary_of_stream(folder, signals, columns)
     if being_written:
+        summary |= {"cut_off": False, "trips": [], "trip_cycle": None}
         return RunRecord(
             signals, summary, f"{folder.path}: the run is in progress; this is what there is so far"
         )

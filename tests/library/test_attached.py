@@ -8,6 +8,7 @@ from commands import COMMAND, PATIENCE_S, Start, wait_for
 
 import canwall
 from canwall.errors import ConfigError
+from canwall.record import read_signals
 
 
 @pytest.mark.slow
@@ -34,6 +35,11 @@ def test_attached_run(start: Start, tmp_path: Path) -> None:
         changed = signals["j"][signals["stiffness"] == 12.5]
         assert changed.tolist() == list(range(softer, changed.iloc[-1] + 1))
         assert changed.iloc[-1] == signals["j"].iloc[-1]
+        wait_for(lambda: read_signals(folder / "signals.parquet").num_rows > 0)
+        so_far = canwall.read(folder)
+        assert isinstance(so_far, canwall.RecordedRun)
+        assert (so_far.trips, so_far.summary["cut_off"]) == ([], False)
+        assert "in progress" in so_far.remarks[0]
         last = run.signals(seconds=0.1)
         assert 1 <= len(last) <= 101
         assert last["j"].iloc[-1] >= signals["j"].iloc[-1]
