@@ -28,6 +28,7 @@ class Scale:
         torque_step_nm: Smallest step of the torque [N·m].
         handle_radius_m: Radius of the handle [m]; None: HANDLE_RADIUS_M.
         laws: Names of the run's laws, to which the rows have indices.
+        orientation: Direction out of the wall on the drive's axis, 1 or −1.
     """
 
     cycle_s: float
@@ -35,6 +36,7 @@ class Scale:
     torque_step_nm: float
     handle_radius_m: float | None = None
     laws: Sequence[str] = ()
+    orientation: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -78,8 +80,11 @@ class _Running:
     largest_nm: float = 0.0
     depth_rad: float = 0.0
 
-    def add(self, y: NDArray[np.float64], force: NDArray[np.float64]) -> None:
-        work = self.energy_j + metrics.energy_out(y, force)
+    def add(self, rows: NDArray[np.void], orientation: float) -> None:
+        y, force = rows["y"], rows["force_applied"]
+        # A wall that moves, to which y is relative, is no motion of the handle.
+        handle = y + orientation * rows["wall_position_rad"]
+        work = self.energy_j + metrics.energy_out(handle, force)
         self.energy_j, self.most_j = float(work[-1]), max(self.most_j, float(work.max()))
         self.force_nm = max(self.force_nm, float(force.max()))
         self.largest_nm = max(self.largest_nm, float(np.abs(force).max()))
@@ -164,7 +169,7 @@ class ContactMeter:
             law = int(first["law"])
             name = self._scale.laws[law] if law < len(self._scale.laws) else ""
             running = _Running(float(first["t_s"]), name, float(first["stiffness"]), whole)
-        running.add(rows["y"], rows["force_applied"])
+        running.add(rows, self._scale.orientation)
         ended = None
         if not lasts:
             self._free_since_s = float(rows["t_s"][-1])

@@ -216,6 +216,7 @@ class Follower:
                 float(settings["rated_torque_nm"]) / 1000.0,
                 settings.get("handle_radius_m"),
                 [law["name"] for law in settings["laws"]],
+                -1.0 if settings["side"] == "above" else 1.0,
             )
         )
         self._buckets = Buckets(math.ceil(1.0 / cycle_s / _POINTS_HZ))
