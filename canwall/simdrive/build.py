@@ -32,11 +32,11 @@ def make_drive(
     """Make the drive that the configuration describes, not yet switched on.
 
     Rated torque and encoder are those of its dictionary (0x6076, 0x608F, 0x6091), and those of
-    the simulation where the dictionary has none, or an encoder of 1/1. A node-ID that LSS has
-    stored takes precedence.
+    the simulation where the dictionary has none, or an encoder of 1/1; a gear of 1/1 is that of
+    `[drive]`. A node-ID that LSS has stored takes precedence.
 
     Args:
-        drive: `[drive]`, for dictionary, node-ID and the unit of 0x6076.
+        drive: `[drive]`, for dictionary, node-ID, gear and the unit of 0x6076.
         simulation: `[simulation]`.
         sync_period_s: time from one SYNC to the next.
         bitrate: of the bus, in bit/s.
@@ -50,7 +50,7 @@ def make_drive(
     dictionary = _dictionary(
         drive, simulation, drive.node_id if node_id == UNCONFIGURED else node_id
     )
-    counts, gear_ratio = _encoder(dictionary, simulation)
+    counts, gear_ratio = _encoder(dictionary, drive, simulation)
     encoder = FaultyEncoder(ServoMotion(simulation, sync_period_s, counts))
     hardware = _hardware(simulation, counts / (2.0 * math.pi), gear_ratio, _rated_unit_nm(drive))
     simulated = ServoDrive(
@@ -91,7 +91,7 @@ def servo_scales(drive: DriveSettings, simulation: Simulation) -> ServoScales:
         DictionaryError: as `make_drive`.
     """
     dictionary = _dictionary(drive, simulation, drive.node_id)
-    counts, gear_ratio = _encoder(dictionary, simulation)
+    counts, gear_ratio = _encoder(dictionary, drive, simulation)
     limits = [
         dictionary.number(index, absent=0).value
         for index in TORQUE_LIMITS
@@ -119,9 +119,13 @@ def _rated_unit_nm(drive: DriveSettings) -> float:
     return drive.rated_torque_unit_nm or MILLI_NM
 
 
-def _encoder(dictionary: Dictionary, simulation: Simulation) -> tuple[float, float]:
+def _encoder(
+    dictionary: Dictionary, drive: DriveSettings, simulation: Simulation
+) -> tuple[float, float]:
     """Return increments per turn of the shaft, and turns of the motor per turn of the shaft."""
     gear_ratio = quotient(dictionary, 0x6091)
+    if gear_ratio == 1.0:  # a drive that was not told of its gear
+        gear_ratio = drive.gear_ratio or 1.0
     # Increments of the encoder, whatever unit the drive shows; 1/1 is no resolution.
     resolution = quotient(dictionary, 0x608F)
     return (simulation.counts_per_rev if resolution == 1.0 else resolution) * gear_ratio, gear_ratio

@@ -15,6 +15,7 @@ from rig import (
 )
 
 from canwall.drive import DriveError, DriveSetup, Field
+from canwall.simdrive import servo_scales
 
 INVALID = 1 << 31
 BIT_30 = 1 << 30
@@ -154,6 +155,15 @@ def test_configuration_goes_first(make_rig: RigFactory) -> None:
     assert units.rated_torque_nm == pytest.approx(6.0)
     asked = {multiplexer(data)[0] for can_id, data in rig.frames if can_id == SDO_REQUEST}
     assert not asked & {0x608F, 0x6091, 0x6076}
+
+
+def test_simulated_drive_has_the_gear_that_its_master_was_given(make_rig: RigFactory) -> None:
+    settings = settings_with({"drive.gear_ratio": 3.0})
+    assert settings.simulation is not None
+    units = make_rig(settings).set_up().units
+    simulated = servo_scales(settings.drive, settings.simulation)
+    assert simulated.gear_ratio == 3.0
+    assert simulated.counts_per_rev == pytest.approx(units.counts_per_rev)
 
 
 @pytest.mark.parametrize(
