@@ -281,7 +281,8 @@ def cached_servo_scales(settings: Settings) -> ServoScales:
         written = drive.eds.stat().st_mtime_ns
     except OSError:
         written = 0
-    key = (str(drive.eds), written, drive.node_id, drive.rated_torque_unit_nm, str(known))
+    told = (drive.node_id, drive.rated_torque_unit_nm, drive.gear_ratio)
+    key = (str(drive.eds), written, *told, str(known))
     return _read_scales(_KeyedSettings(settings, key))
 
 

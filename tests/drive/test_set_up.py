@@ -15,7 +15,7 @@ from rig import (
 )
 
 from canwall.drive import DriveError, DriveSetup, Field
-from canwall.simdrive import servo_scales
+from canwall.run.closed_loop import cached_servo_scales
 
 INVALID = 1 << 31
 BIT_30 = 1 << 30
@@ -158,10 +158,10 @@ def test_configuration_goes_first(make_rig: RigFactory) -> None:
 
 
 def test_simulated_drive_has_the_gear_that_its_master_was_given(make_rig: RigFactory) -> None:
+    assert cached_servo_scales(settings_with()).gear_ratio == 1.0
     settings = settings_with({"drive.gear_ratio": 3.0})
-    assert settings.simulation is not None
     units = make_rig(settings).set_up().units
-    simulated = servo_scales(settings.drive, settings.simulation)
+    simulated = cached_servo_scales(settings)
     assert simulated.gear_ratio == 3.0
     assert simulated.counts_per_rev == pytest.approx(units.counts_per_rev)
 
