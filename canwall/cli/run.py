@@ -289,7 +289,8 @@ def _strike_table(strikes: list[dict[str, Any]]) -> Table:
     for count, strike in enumerate(strikes, start=1):
         chatter = "no"
         if strike["chatter"]:
-            chatter = f"yes, {strike['chatter_frequency_hz']:.0f} Hz"
+            frequency = strike["chatter_frequency_hz"]
+            chatter = f"yes, {frequency:.0f} Hz" if frequency else "yes"
         table.add_row(
             str(count),
             escape(short_law(strike["law"])),

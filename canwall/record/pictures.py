@@ -204,7 +204,8 @@ def verdict(strike: dict[str, Any]) -> str:
     """Return in words whether a strike chattered, with the frequency as the table has it."""
     if not strike["chatter"]:
         return "no chatter"
-    return f"chatter, {strike['chatter_frequency_hz']:.0f} Hz"
+    frequency = strike["chatter_frequency_hz"]
+    return f"chatter, {frequency:.0f} Hz" if frequency else "chatter"
 
 
 def draw_strikes(

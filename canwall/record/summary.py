@@ -50,6 +50,11 @@ def summarise(
     handle = y + settings.wall.orientation * numbers(signals, "wall_position_rad")
     work = metrics.energy_out(handle, force)
     touched = metrics.contacts(np.where(rendering, y, np.inf), force)
+    if touched and touched[0].start == (begin := int(np.argmax(rendering))):
+        # The handle was inside at the start, and the wall fades in around it: nothing has struck.
+        faded = begin + round(settings.run.ramp_in_s / settings.bus.cycle_s)
+        rest = slice(faded, touched[0].stop)
+        touched[:1] = [rest] if rest.stop > faded + 1 else []
     names = ("stiffness_in_force", "mass_est", "mass_spread", "delay_est")
     in_force = {name: numbers(signals, name) for name in names}
     found = metrics.strikes(touched, settings.bus.cycle_s, _changes(signals))

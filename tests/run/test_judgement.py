@@ -17,7 +17,7 @@ from canwall.cli.run import _strike_table
 from canwall.config import Settings
 from canwall.record import ROW, Phase, read_signals
 from canwall.record.columns import record_batch
-from canwall.record.pictures import draw_run
+from canwall.record.pictures import draw_run, verdict
 from canwall.run import run
 from canwall.run.closed_loop import SIGNALS, ClosedLoop, simulate, simulate_loop
 from canwall.run.result import judged
@@ -194,3 +194,35 @@ def test_a_wall_that_throws_the_handle_chatters_as_in_a_sweep(
     assert judgement["chatter_amplitude_rad"] == measures["amplitude"]
     (judgement,) = judged(table, settings, found.units)["strikes"]
     assert not judgement["chatter"]  # ended by something else
+
+
+def test_wall_that_fades_in_around_the_handle_is_not_struck(tmp_path: Path) -> None:
+    # The hand rests in the wall, withdraws before it is whole, and strikes from the other side.
+    settings = settings_with({"wall.side": "above", "run.duration_s": 1.05})
+    (judgement,) = run(settings, tmp_path / "left").summary["strikes"]
+    assert judgement["start_s"] > 0.7
+    # A hand that stays meets the wall when it is whole.
+    settings = settings_with({"wall.position_rad": 0.15, "run.duration_s": 0.8})
+    simulation = settings.simulation
+    assert simulation is not None
+    hand = simulation.hand.model_copy(update={"first_strike_s": 3.0})
+    simulation = simulation.model_copy(update={"hand": hand})
+    settings = settings.model_copy(update={"simulation": simulation})
+    (judgement,) = run(settings, tmp_path / "stayed").summary["strikes"]
+    assert judgement["start_s"] == pytest.approx(settings.run.ramp_in_s, abs=0.02)
+    # Friction of 0.01 N·m holds either somewhere within 0.2 mrad of its rest at 50 N·m/rad.
+    assert judgement["first_depth_rad"] == pytest.approx(
+        judgement["referent_first_depth_rad"], abs=0.4e-3
+    )
+    assert not judgement["chatter"]
+
+
+def test_chatter_without_a_frequency_is_said_without() -> None:
+    table, settings, units, _ = strike("finger", 430.0)
+    (judgement,) = judged(table, settings, units)["strikes"]
+    judgement |= {"chatter": True, "chatter_frequency_hz": 0.0}
+    console = Console(width=80, color_system=None)
+    with console.capture() as capture:
+        console.print(_strike_table([judgement]))
+    assert "Hz" not in capture.get()
+    assert verdict(judgement) == "chatter"
