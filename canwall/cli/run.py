@@ -137,7 +137,8 @@ def _tell(results: "Sequence[RunResult]", as_json: bool) -> int:
         if as_json:
             print_json({"record": result.folder.path} | result.summary)
         else:
-            console.print(_strike_table(result.summary["strikes"]))
+            strikes = result.summary["strikes"]
+            console.print(_strike_table(strikes) if strikes else "No strike: nothing has pressed.")
             console.print(f"record: {result.folder.path}", soft_wrap=True, highlight=False)
             for advice in result.summary["timing"]["advice"] if result is results[0] else ():
                 console.print(advice, soft_wrap=True, highlight=False, markup=False)

@@ -216,7 +216,7 @@ class Limits(Section):
 class Guard(Section):
     """`[guard]`: what becomes of a wall that buzzes: nothing, a word, or less force for a while."""
 
-    action: Literal["off", "warn", "act"] = "off"
+    action: Literal["off", "warn", "act"] = "warn"
 
 
 class Run(Section):

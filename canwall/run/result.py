@@ -1,5 +1,6 @@
 """Result of a run: its summary and remarks."""
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ from canwall.drive import DriveSetup
 from canwall.errors import RunFailedError
 from canwall.record import Phase, RecordError, RunFolder, numbers, read_signals
 from canwall.record.summary import summarise
+from canwall.run.closed_loop import simulated_units
 from canwall.run.referent import referent_motion
 from canwall.run.torque_delay import delay_in_record
 from canwall.units import DriveUnits
@@ -243,9 +245,26 @@ def remarks_on(setup: DriveSetup, settings: Settings) -> list[str]:
             f"the drive limits the torque to {setup.torque_limit_nm:g} N·m ({source}), below "
             f"limits.torque_nm = {settings.limits.torque_nm:g}; [drive.parameters] may raise it"
         )
+    remarks += _remarks_on_scales(setup, settings)
     if setup.watchdog.kind == "none":
         remarks.append("the drive has no watchdog: a master that dies leaves the torque on")
     return remarks
+
+
+def _remarks_on_scales(setup: DriveSetup, settings: Settings) -> list[str]:
+    """Return a remark for each scale in [drive] that is not the simulated drive's."""
+    if settings.simulation is None:
+        return []
+    simulated = simulated_units(settings)
+    return [
+        f"drive.{name} = {asked:.9g}, but the simulated drive has {has:.9g}: everything is scaled "
+        f"by the difference; leave the key out, or change the drive in [simulation.objects]"
+        for name in ("counts_per_rev", "rated_torque_nm")
+        if getattr(settings.drive, name)
+        and not math.isclose(
+            asked := getattr(setup.units, name), has := getattr(simulated, name), rel_tol=1e-3
+        )
+    ]
 
 
 def _drive_summary(setup: DriveSetup) -> dict[str, Any]:

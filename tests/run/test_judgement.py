@@ -13,7 +13,7 @@ from rig import settings_with
 
 from canwall import config
 from canwall.analysis.felt import band_rms, felt_band
-from canwall.cli.run import _strike_table
+from canwall.cli.run import _strike_table, _tell
 from canwall.config import Settings
 from canwall.record import ROW, Phase, read_signals
 from canwall.record.columns import record_batch
@@ -110,6 +110,18 @@ def test_measurement_of_the_delay_is_no_contact(tmp_path: Path) -> None:
     before = signals["t_s"].to_numpy() < 1.1
     assert not signals["force_applied"].to_numpy()[before].any()
     assert not signals["torque_applied"].to_numpy()[before & ~measures].any()
+
+
+def test_scale_that_is_not_the_simulated_drives_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And a run in which nothing has pressed says so."""
+    told = {"drive.counts_per_rev": 120000.0, "run.duration_s": 0.1}
+    result = run(settings_with(told), tmp_path / "run")
+    (remark,) = (text for text in result.remarks if "counts_per_rev" in text)
+    assert "drive.counts_per_rev = 120000, but the simulated drive has 131072" in remark
+    assert _tell([result], as_json=False) == 0
+    assert "No strike: nothing has pressed." in capsys.readouterr().out
 
 
 def test_lost_rows_do_not_shift_times_and_referent() -> None:
