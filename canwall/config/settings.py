@@ -100,7 +100,7 @@ class Wall(Section):
     deadbeat: bool = False
     velocity: Literal["difference", "estimated"] = "difference"
     options: dict[str, Number] = Field(default_factory=dict)
-    tension: Literal["allow", "clamp", "budget"] = "allow"
+    tension: Literal["allow", "clamp", "budget"] = "clamp"
     passivity_nm_s_per_rad: NonNegative = 0.0
     divider: int = Field(1, ge=1, le=1000)
     alternate: Names = ()
