@@ -7,7 +7,13 @@ from typing import Any
 import tomli_w
 
 from canwall.analysis.felt import HANDLE_RADIUS_M
-from canwall.bench.soft_wall import TORQUE_PART, WORST_DELAY, soft_stiffness, soft_torque
+from canwall.bench.soft_wall import (
+    TORQUE_PART,
+    WORST_DELAY,
+    rounded_down,
+    soft_stiffness,
+    soft_torque,
+)
 from canwall.config import Bus as BusSettings
 from canwall.config import Drive as DriveSettings
 from canwall.drive import REQUIRED_OBJECTS, DriveNode, Link
@@ -88,7 +94,9 @@ def draft(
         inertia_kg_m2: Inertia of drive and handle.
         output: File of the configuration; the EDS is given relative to its folder if it is in it.
     """
-    torque = soft_torque(facts.rated_torque_nm)
+    torque, part = soft_torque(facts.rated_torque_nm), f"{TORQUE_PART:.0%} of the rated torque"
+    if facts.scales.torque_limit_nm < torque:
+        torque, part = rounded_down(facts.scales.torque_limit_nm, 2), "all that the drive gives"
     stiffness = soft_stiffness(inertia_kg_m2, 0.0, bus.cycle_s)
     # Tenths of a radian: the wall is where the handle was, and easy to move.
     here = round(facts.position_rad, 1)
@@ -139,7 +147,7 @@ adapt = true                   # the hand is identified in the cycle
 action = "warn"                # a wall that buzzes is reported; "act": it is made softer at once
 
 [limits]
-{_line("torque_nm", torque, f"{TORQUE_PART:.0%} of the rated torque")}
+{_line("torque_nm", torque, part)}
 {_line("speed_rad_s", _SPEED_RAD_S, "beyond: torque zero, drive disabled")}
 {_line("position_rad", [low, high], "outside: likewise")}
 """

@@ -1,5 +1,6 @@
-"""The draft of `canwall init` is TOML, whatever a drive needs."""
+"""The draft of `canwall init` is TOML, and asks for no more than the drive gives."""
 
+import dataclasses
 import tomllib
 from pathlib import Path
 
@@ -18,3 +19,15 @@ def test_negative_parameters(make_rig: RigFactory, tmp_path: Path) -> None:
     facts = DriveFacts(setup.identity, setup.scales, 0.0)
     text = draft(settings.bus, drive, facts, "A drive", 1e-4, tmp_path / "first.toml")
     assert tomllib.loads(text)["drive"]["parameters"] == parameters
+
+
+def test_no_more_torque_than_the_drive_gives(make_rig: RigFactory, tmp_path: Path) -> None:
+    setup = make_rig().set_up()
+    assert setup.identity
+    assert setup.scales
+    scales = dataclasses.replace(setup.scales, torque_limit_nm=0.0257)
+    settings = settings_with()
+    facts = DriveFacts(setup.identity, scales, 0.0)
+    text = draft(settings.bus, settings.drive, facts, "A drive", 1e-4, tmp_path / "first.toml")
+    assert tomllib.loads(text)["limits"]["torque_nm"] == 0.025
+    assert "# all that the drive gives" in text
