@@ -12,6 +12,7 @@ A law pays for too little delay in its model with several times the stiffness th
 
 import math
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,15 +76,31 @@ class DelayTest:
             self._torques[part] = amplitude * excitation(cycles, length, _SEED + k)
         self._positions: list[float] = []
         self._forces: list[float] = []
+        self._fit: Future[Delay] | None = None
+        if settings.real_time:
+            self._thread = ThreadPoolExecutor(1)
+            # The first fit takes several times as long, and a drive's watchdog may not wait for it.
+            unit, push = Mechanics(inertia_kg_m2=1.0), np.ones(_LONGEST)
+            motion = _motion(_scales(1.0, unit, 1.0), 0.0, push, 1.0)
+            measured_delay(motion, push, 1.0, unit)
 
     def excite(self) -> bool:
-        """Set the torque of the next cycle; return False at the end."""
+        """Set the torque of the next cycle; return False at the end.
+
+        SYNCs with zero torque go on during the fit if the drive's watchdog goes by the clock.
+        """
         k = len(self._positions)
         self.axis.cycle["test_per_mille"] = self._torques[k] if k < self.cycles else 0
-        return k < self.cycles
+        if k < self.cycles or not self.axis.settings.real_time:
+            return k < self.cycles
+        if self._fit is None:
+            self._fit = self._thread.submit(self.measured)
+        return not self._fit.done()
 
     def note(self) -> None:
         """Store position and torque of the last cycle."""
+        if len(self._positions) == self.cycles:
+            return
         row = self.axis.row[0]
         self._positions.append(float(row["position_rad"]) if row["received"] else math.nan)
         self._forces.append(float(row["torque_cmd"]))
@@ -92,7 +109,7 @@ class DelayTest:
         """Set D of the axis, at the upper end of its interval. Raises ExperimentError."""
         axis = self.axis
         try:
-            delay = self.measured()
+            delay = self._fit.result() if self._fit else self.measured()
         except ValueError as error:
             raise ExperimentError(axis, str(error)) from None
         axis.delay = min(delay.value + delay.half, float(MAX_DELAY))

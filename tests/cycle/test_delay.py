@@ -1,6 +1,8 @@
 """The delay D: by the fit alone, and as the loop measures it on the simulated drive."""
 
 import math
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from rig import SIM_CONFIG, Loop, RigFactory, settings_with
 
 from canwall import config
 from canwall.config import Mechanics, Settings
-from canwall.cycle.delay import Delay, agreed_delay, excitation, measured_delay
+from canwall.cycle.delay import Delay, DelayTest, agreed_delay, excitation, measured_delay
 from canwall.physics import zoh
 from canwall.record import Phase
 from canwall.walls import MAX_DELAY
@@ -192,3 +194,26 @@ def test_lag_of_a_servo_that_nothing_tells(make_rig: RigFactory) -> None:
     assert loop.run(870).trips == []
     lag_s = 1.0 / (2.0 * math.pi * 1600.0)
     assert loop.axis.delay == pytest.approx(1.0 + (0.00025 + lag_s) / PERIOD, abs=0.03)
+
+
+def test_syncs_go_on_during_the_fit(make_rig: RigFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the clock, no watchdog waits for the fit; in simulated time none has to."""
+    fitting = threading.Event()
+
+    def measured(test: DelayTest) -> Delay:
+        assert fitting.wait(10.0)
+        return Delay(1.4, 0.1)
+
+    monkeypatch.setattr(DelayTest, "measured", measured)
+    axis = Loop(make_rig(settings_with({"bus.pace": "real_time"}))).axis
+    test = DelayTest(axis)
+    for _ in range(test.cycles + 3):
+        assert test.excite()
+        test.note()
+    assert axis.cycle["test_per_mille"] == 0
+    fitting.set()
+    deadline = time.monotonic() + 10.0
+    while test.excite():
+        assert time.monotonic() < deadline
+    test.conclude()
+    assert axis.delay == pytest.approx(1.5)
