@@ -29,6 +29,9 @@ _IDEAL_DRIVE = {"drive_cycle_s": 0.0, "current_bandwidth_hz": 0.0}
 #: Rest between the two parts of the measurement of the delay [cycles].
 _REST_CYCLES = 50
 
+#: Time in which a drive is set up [s], which passes for a hand that goes by the clock.
+_SET_UP_S = 2.0
+
 #: Largest radius of a handle [m].
 HANDLE_MAX_M = 10.0
 
@@ -397,6 +400,8 @@ class Settings(Section):
         if not (estimator.measure_delay is True or unknown):
             return self
         measured_s = estimator.measurements[-1].stop * self.bus.cycle_s
+        if simulation.real_time:
+            measured_s += _SET_UP_S
         update = {"first_strike_s": measured_s + simulation.hand.first_strike_s}
         hand = simulation.hand.model_copy(update=update)
         simulation = simulation.model_copy(update={"hand": hand})

@@ -87,7 +87,12 @@ def minimal(more: str = "") -> Settings:
 
 @pytest.mark.parametrize(
     ("more", "first_s"),
-    [("", 1.9), ("ideal = true", 0.2), ("hand.first_strike_s = 0.3", 0.3)],
+    [
+        ("", 1.9),
+        ("real_time = true", 3.9),
+        ("ideal = true", 0.2),
+        ("hand.first_strike_s = 0.3", 0.3),
+    ],
 )
 def test_first_strike_comes_after_the_measurement_of_the_delay(more: str, first_s: float) -> None:
     simulation = minimal(more).simulation
