@@ -229,7 +229,7 @@ def _suggestion(where: list[str], model: Any) -> str:
         annotation = model.model_fields[part].annotation
         candidates = [annotation, *get_args(annotation)]
         model = next(c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel))
-    known = list(model.model_fields)
+    known = [key for key in model.model_fields if key != "do"]  # names the request, not the wall
     if where[-1] in _METRIC_KEYS:
         return "; lengths and forces at the handle need mechanics.handle_radius_m"
     return did_you_mean(where[-1], known) or f"; known here: {', '.join(known)}"

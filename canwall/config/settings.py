@@ -268,6 +268,14 @@ class WallChange(_WallKeys):
     guard: GuardChange | None = None
     operator: OperatorChange | None = None
 
+    @model_validator(mode="after")
+    def _one_damping(self) -> Self:
+        if self.damping_ratio and self.damping_nm_s_per_rad:
+            raise ValueError(
+                "damping_ratio: damping_nm_s_per_rad is given as well; keep one of them"
+            )
+        return self
+
     def applied_to(self, wall: Wall, limits: Limits) -> tuple[Wall, Limits]:
         """Return wall and limits after the change."""
         keys = set(_WallKeys.model_fields)

@@ -47,6 +47,10 @@ def test_request(values: dict[str, Any], kind: type) -> None:
         ({"do": "change", "stiffness_nm_per_rad": float("nan")}, "stiffness_nm_per_rad: has to"),
         ({"do": "change", "guard": {"action": "ac"}}, "guard.action: has to be 'off', 'warn' or"),
         ({"do": "change", "operator": {"filters": 5}}, "operator.filters: unknown key"),
+        (
+            {"do": "change", "damping_ratio": 0.5, "damping_nm_s_per_rad": 0.1},
+            "damping_ratio: damping_nm_s_per_rad is given as well; keep one of them",
+        ),
         ({"do": "take_turns"}, "walls: is missing"),
         (
             {"do": "take_turns", "walls": [{}] * 17},
@@ -84,3 +88,8 @@ def test_schedule_has_the_same_keys() -> None:
     raw["schedule"][1]["operator"] = {"adapt": True}
     with pytest.raises(ValueError, match=r"schedule: operator\.adapt: \[mechanics\] is with"):
         type(settings).model_validate(raw)
+
+
+def test_request_itself_is_no_key_of_the_wall() -> None:
+    with pytest.raises(ConfigError, match=r"zzz: unknown key; known here: law, .*, operator$"):
+        parse_request({"do": "change", "zzz": 1})

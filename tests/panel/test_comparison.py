@@ -81,7 +81,7 @@ changes = st.fixed_dictionaries(
         "tension": st.sampled_from(["allow", "clamp"]),
         "deadbeat": st.booleans(),
     },
-)
+).filter(lambda one: not (one.get("damping_ratio") and one.get("damping_nm_s_per_rad")))
 
 
 @given(
