@@ -38,6 +38,8 @@ _LEFT, _RIGHT, _TOP, _BOTTOM, _GAP, _AXES_GAP = 0.8, 0.6, 0.3, 0.5, 0.15, 0.75
 _HEIGHTS = (1.75, 1.25, 0.95, 2.2)
 #: Columns of pixels in which long signals are drawn, and the width of a letter [points].
 _COLUMNS, _LETTER = 1200, 5.2
+#: Largest stiffness asked for that is shown, in that of the largest in force.
+_MOST_ASKED = 4.0
 #: Intervals between ticks; each tick takes time.
 _TICKS = 5
 
@@ -296,7 +298,9 @@ def draw_in_force(axes: Axes, signals: "pa.Table") -> Axes:
     # Colours stand for laws here, so these lines have none.
     axes.plot(t, asked, color="0.2", lw=0.9, ls="--", label="K asked")
     axes.plot(t, in_force, color="0.2", lw=1.3, label="K in force")
-    axes.set_ylim(bottom=0.0)
+    # A stiffness far beyond what the cap allows would hide that in force.
+    top = _MOST_ASKED * np.max(in_force, initial=0.0)
+    axes.set_ylim(0.0, top if 0.0 < top < np.max(asked, initial=0.0) else None)
     axes.margins(x=0.01)
     axes.set_title("Mass and stiffness in force")
     axes.set_ylabel("K\n[N·m/rad]")

@@ -21,6 +21,7 @@ from canwall.figure_style import CHATTER
 from canwall.record import RunFolder
 from canwall.record.pictures import (
     DRAWN,
+    draw_in_force,
     draw_strikes,
     law_colours,
     plot_run,
@@ -223,3 +224,14 @@ def test_no_state_is_left_in_pyplot(copied: RunFolder) -> None:
     plot_run(copied)
     assert plt.get_fignums() == []
     assert not plt.rcParams["axes.grid"]
+
+
+@pytest.mark.parametrize(("asked", "top"), [(1e9, 320.0), (90.0, 90.5)])
+def test_stiffness_asked_for_does_not_hide_that_in_force(asked: float, top: float) -> None:
+    columns = {"stiffness": asked, "stiffness_in_force": 80.0, "mass_est": 1e-4}
+    signals = {name: np.full(100, value) for name, value in columns.items()}
+    axes = Figure().add_subplot()
+    draw_in_force(axes, pa.table(signals | {"t_s": np.arange(100) * 1e-3}))
+    low, high = axes.get_ylim()
+    assert low == 0.0
+    assert high == pytest.approx(top, rel=0.02)
