@@ -144,10 +144,15 @@ def agreed_delay(found: Sequence[Delay]) -> Delay:
 def excitation(cycles: int, length: int, seed: int = _SEED) -> NDArray[np.int64]:
     """Return signs of the torque, shape (cycles,), in pairs that leave the handle at rest.
 
-    Each torque of a pair lasts for `length` cycles; an incomplete pair at the end is left out.
+    Each torque of a pair lasts for `length` cycles. Before some of the pairs there is a cycle
+    without torque: otherwise a drive whose own cycle goes 2½ times into that of the SYNC would take
+    over all torques at the same phase, and the delay would be that of this phase.
     """
-    signs = np.random.default_rng(seed).choice([-1, 1], size=cycles // (2 * length))
+    draw = np.random.default_rng(seed)
+    signs = draw.choice([-1, 1], size=cycles // (2 * length + 1))
     pairs = np.stack([signs, -signs], axis=1).reshape(-1).repeat(length)
+    pauses = 2 * length * np.flatnonzero(draw.integers(2, size=len(signs)))
+    pairs = np.insert(pairs, pauses, 0)
     return np.concatenate([pairs, np.zeros(cycles - len(pairs))]).astype(np.int64)
 
 
@@ -172,8 +177,11 @@ def measured_delay(position: Array, torque: Array, period: float, mechanics: Mec
         guess = min(guesses, key=lambda parameters: float(np.sum(misses(parameters) ** 2)))
         low = np.array([1e-3, 0.0, 0.0, 0.0, -1.0, 0.0])
         high = np.array([1e3, 1e3, 1e3, 1.0, 1.0, float(MAX_DELAY)])
-        inside = np.clip(guess, low + 1e-6, high - 1e-6)
-        fit = least_squares(misses, inside, bounds=(low, high), x_scale=0.1)
+        inside = [np.clip(guess, low + 1e-6, high - 1e-6)]
+        # A handle that sticks makes minima of its own: from some friction, and from none.
+        inside.append(np.where(np.arange(6) == 3, 1e-6, inside[0]))
+        fits = [least_squares(misses, x, bounds=(low, high), x_scale=0.1) for x in inside]
+        fit = min(fits, key=lambda fit: float(fit.cost))
         if _rms(fit.fun) ** 2 < 1.0 - _EXPLAINED:
             delay = Delay(float(fit.x[-1]), _half_interval(np.asarray(fit.jac), fit.fun))
             if delay.half <= _UNCERTAIN:

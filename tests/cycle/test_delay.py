@@ -130,6 +130,31 @@ def test_excitation_gives_the_handle_no_lasting_speed() -> None:
         assert np.cumsum(signs)[-1] == 0
 
 
+def ticked(torque: np.ndarray, phase: float, every: float) -> np.ndarray:
+    """Positions that a drive latches at ticks of its own, at which it takes torques over.
+
+    Times in periods; the torques are those of the SYNC before.
+    """
+    steps = 1000
+    tick = round(every * steps)
+    now = np.arange(len(torque) * steps)
+    last = np.maximum((now - round(phase * tick)) // tick * tick + round(phase * tick), 0)
+    force = np.concatenate([[0.0], torque])[last // steps]
+    h = PERIOD / steps
+    v = np.concatenate([[0.0], np.cumsum(force)[:-1]]) * h / 2e-4
+    position = np.cumsum(v + 0.5 * h * force / 2e-4) * h
+    return np.concatenate([[0.0], position])[last[::steps]]
+
+
+@pytest.mark.parametrize("phase", [0.05, 0.55])
+@pytest.mark.parametrize("length", [2, 4])
+def test_ticks_of_the_drive_do_not_keep_step_with_the_torques(length: int, phase: float) -> None:
+    """A tick every 0.4 ms has one of two phases against the SYNC, in turn."""
+    torque = 0.15 * excitation(400, length)
+    found = measured_delay(ticked(torque, phase, 0.4), torque, PERIOD, KNOWN)
+    assert found.value == pytest.approx(1.4, abs=0.04)
+
+
 def with_hand_at_rest(settings: Settings) -> Settings:
     """Let the first strike come after the measurement."""
     assert settings.simulation is not None
