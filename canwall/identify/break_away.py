@@ -16,7 +16,8 @@ def break_away(
 
     Each ramp begins after _REST_S without torque, and ends at zero torque. A handle that has just
     broken loose under a torque that rises with r needs (6·s·m/r)^⅓ for its first steps s, or less
-    if friction falls: the torque is that at the middle of this time before they were seen.
+    if friction falls: the torque is that at the middle of this time before they were seen. They are
+    seen, and a held torque has risen, half a period late on average.
 
     Args:
         position: Positions at the SYNCs [rad].
@@ -46,8 +47,9 @@ def break_away(
         rate = (torque[at - 1] - torque[start]) / (moved[0] - 1) / period
         if rate == 0.0:
             continue
-        took = (6.0 * 3.0 * step * inertia / abs(rate)) ** (1.0 / 3.0)
-        late = 0.5 * took + (delay - 1.0) * period
+        # More than three steps are at least three, and at most five.
+        took = (6.0 * 4.0 * step * inertia / abs(rate)) ** (1.0 / 3.0)
+        late = 0.5 * took + delay * period
         found.append((rest, torque[at - 1] - rate * late, 0.5 * abs(rate) * (took + period)))
     place, loose, error = np.array(found).reshape(-1, 3).T
     return place, loose, error

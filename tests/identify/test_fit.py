@@ -88,6 +88,22 @@ def test_break_away_of_a_ramp(delay: float) -> None:
     assert uncertain[0] < 0.001
 
 
+@pytest.mark.parametrize("rest", [-0.45, 0.0, 0.45])
+@pytest.mark.parametrize("loose_at", [60.0, 60.3, 60.7])
+def test_torque_of_break_away_is_that_of_a_held_ramp(loose_at: float, rest: float) -> None:
+    """Friction that stays as it was at rest, and a handle that rests anywhere in its count."""
+    rate, inertia, delay, fine = 0.05, 1e-4, 1.25, 100
+    torque = rate * PERIOD * np.maximum(np.arange(-150, 200), 0)
+    commanded = (np.arange(350 * fine) / fine - delay).astype(int)
+    holds = rate * PERIOD * loose_at
+    free = np.maximum(torque[np.maximum(commanded, 0)] - holds, 0.0)
+    speed = np.cumsum(free) * PERIOD / fine / inertia
+    position = 0.3 + COUNT * rest + np.cumsum(speed)[::fine] * PERIOD / fine
+    position = np.round(position / COUNT) * COUNT
+    _, loose, uncertain = break_away(position, torque, PERIOD, COUNT, inertia, delay)
+    assert loose == pytest.approx([holds], abs=float(uncertain[0]))
+
+
 def test_torque_that_passes_through_zero_is_no_ramp() -> None:
     time = np.arange(2000) * PERIOD
     torque = np.round(0.05 * np.sin(2.0 * np.pi * time), 3)
