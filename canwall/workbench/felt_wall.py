@@ -1,6 +1,7 @@
 """Figures of the impedance that a person feels of a wall, and of where the wall is stable."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -43,7 +44,9 @@ _STIFFNESS, _DAMPING, _VISCOUS = 10.0, 0.01, 0.02
 _BIAS, _AMPLITUDE = -0.3, 0.15
 #: Cycles of a period of the push, periods in all, and those left out at the start.
 _SAMPLES, _PERIODS, _FIRST = 1000, 8, 2
-_LINES = np.unique(np.geomspace(1.0, 400.0, 30).round().astype(np.int64))
+#: Lines of the push, up to a quarter of the rate: beyond, the images of a push that is straight
+#: between two SYNCs move the handle as well.
+_LINES = np.unique(np.geomspace(1.0, 250.0, 30).round().astype(np.int64))
 
 #: Stiffness of the plain wall in Diolaiti's plane [N·m/rad], and its axes.
 _PLANE_STIFFNESS = 200.0
@@ -96,7 +99,10 @@ def measure_impedance(law: str) -> EffectiveImpedance:
     signals = np.empty((SIGNALS, cycles))
     simulate_loop(loop, np.zeros(1, ROW), signals)
     push, y = push.reshape(_PERIODS, -1), signals[0].reshape(_PERIODS, -1)
-    return impedance_at_lines(push[_FIRST:], y[_FIRST:], settings.bus.cycle_s, _LINES)
+    found = impedance_at_lines(push[_FIRST:], y[_FIRST:], settings.bus.cycle_s, _LINES)
+    # Of a line at the SYNCs, sinc² is in the straight pieces between them.
+    straight = np.sinc(found.frequency * settings.bus.cycle_s) ** 2
+    return replace(found, impedance=found.impedance * straight)
 
 
 def draw_impedance() -> Iterator[FigurePage]:

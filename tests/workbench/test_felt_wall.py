@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from canwall.analysis.analytic_limits import DiolaitiRegion, diolaiti_region
+from canwall.physics import zoh
 from canwall.workbench.felt_wall import measure_impedance, plain_wall_motion
 
 
@@ -38,3 +39,15 @@ def test_a_sampled_spring_takes_one_and_a_half_periods_of_damping() -> None:
     np.testing.assert_allclose(plain.stiffness[plain.frequency < 5.0], 10.0, rtol=0.02)
     damped = measure_impedance("damped")
     np.testing.assert_allclose((damped.damping - plain.damping)[slow], 0.01, rtol=0.15)
+
+
+@pytest.mark.slow
+def test_impedance_of_a_plain_wall_is_that_of_the_sampled_loop() -> None:
+    """F/Y of a sinusoidal push on m and b, with −K·y held a period after its sample."""
+    found = measure_impedance("standard")
+    s = 2j * np.pi * found.frequency
+    z = np.exp(1e-3 * s)
+    phi, gamma = zoh(1e-4, 0.02, 0.0, 1e-3)
+    held = np.array([np.linalg.solve(each * np.eye(2) - phi, gamma)[0] for each in z])
+    exact = (1e-4 * s**2 + 0.02 * s) * (1.0 + 10.0 * held / z)
+    np.testing.assert_allclose(np.abs(found.impedance / exact - 1.0), 0.0, atol=0.03)
