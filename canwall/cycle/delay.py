@@ -95,6 +95,7 @@ class DelayTest:
             return k < self.cycles
         if self._fit is None:
             self._fit = self._thread.submit(self.measured)
+            self._thread.shutdown(wait=False)
         return not self._fit.done()
 
     def note(self) -> None:
