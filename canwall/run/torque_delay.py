@@ -6,7 +6,7 @@ y[j+s] − 2y[j] + y[j−s] = (sT)²/m·Σ β_k(D)·u[j−k], with weights β th
 is the one that leaves the least squares; mass, damping and spring of handle and hand are fitted
 with it, and the difference to the same s periods before leaves out what pulls slowly. The longer s,
 the less the counts of the encoder matter, and the more the hand does: the first s is taken for
-which the torques explain the motion.
+which the torques explain what damping and spring leave of the motion.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Spacings s of the differences [periods], and the share of the motion that has to be explained.
+#: Spacings s of the differences [periods], and the share that the torques have to explain.
 _SPACINGS, _EXPLAINED = (1, 2, 4, 8), 0.9
 #: Latest cycles with a torque that are looked at, and the fewest that tell anything.
 _MOST, _FEWEST = 2_000, 200
@@ -76,10 +76,11 @@ def _area(end: Array) -> Array:
 
 
 def _best_delay(moments: Array, weights: list[Array]) -> tuple[float, float]:
-    """Return the delay whose torques explain the most, and the share that they explain.
+    """Return the delay whose torques explain the most, and their share of what is left to explain.
 
-    It lies between the compared ones, by a parabola; at their ends there is none, which explains
-    nothing.
+    The steps of a position that a drive latches at ticks of its own look like damping, which leaves
+    hardly anything of them. The delay lies between the compared ones, by a parabola; at their ends
+    there is none, which explains nothing.
     """
     explained = np.array([_explained(moments, each) for each in weights])
     k = int(np.argmax(explained))
@@ -87,7 +88,10 @@ def _best_delay(moments: Array, weights: list[Array]) -> tuple[float, float]:
         return float(_DELAYS[k]), 0.0
     before, best, after = explained[k - 1 : k + 2]
     shift = 0.5 * (before - after) / (before - 2.0 * best + after)
-    return float(_DELAYS[k] + shift * (_DELAYS[1] - _DELAYS[0])), float(best / moments[0, 0])
+    right = moments[-2:, 0]
+    by_others = right @ np.linalg.lstsq(moments[-2:, -2:], right, rcond=None)[0]
+    share = (best - by_others) / (moments[0, 0] - by_others)
+    return float(_DELAYS[k] + shift * (_DELAYS[1] - _DELAYS[0])), float(share)
 
 
 def _explained(moments: Array, weights: Array) -> float:

@@ -67,6 +67,19 @@ def test_what_tells_nothing() -> None:
         assert delay_in_record(position, commanded) is None
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_position_of_ticks_is_no_damping(seed: int) -> None:
+    """A free mass, of a drive that takes torques over and latches its position every 0.4 ms."""
+    torque = 0.1 * np.repeat(np.random.default_rng(seed).normal(size=700), 3)
+    last = (np.arange(100 * len(torque)) - 13) // 40 * 40 + 13
+    force = np.where(last < 100, 0.0, torque[last // 100 - 1])
+    position = np.cumsum(np.cumsum(force)) * (PERIOD / 100) ** 2 / 2e-4
+    position = position[np.maximum(last[::100], 0)]
+    found = delay_in_record(np.rint(position / COUNT) * COUNT, torque)
+    assert found is not None
+    assert found[0] == pytest.approx(1.4, abs=0.15)
+
+
 #: The ideal drive of the closed forms, and one that lags.
 DRIVES: dict[str, dict[str, Any]] = {
     "ideal": {
