@@ -72,11 +72,11 @@ def test_k_limits_are_those_of_a_sweep(tmp_path: Path, capsys: pytest.CaptureFix
     assert [row[0] for row in off[1:]] == ["mean_force, 1600 Hz + 0.25 ms"]
     # The same walls, one by one, without a cap and with what each law may know.
     settings = config.load(SERVO)
-    wall = settings.wall.model_copy(update={"cap": None})
+    wall = settings.wall.model_copy(update={"cap": 0.0})
     knowing = settings.model_copy(update={"wall": wall})
     plain = settings.model_copy(
         update={
-            "wall": wall.model_copy(update={"damping_ratio": None}),
+            "wall": wall.model_copy(update={"damping_ratio": 0.0}),
             "operator": settings.operator.model_copy(update={"adapt": False}),
         }
     )
