@@ -218,8 +218,8 @@ def make_cycle(settings: Settings, setup: DriveSetup, laws: Sequence[Law]) -> ND
     if _plain_walk(settings) is None:
         masses, dampings = _hands(settings)
         mass, viscous = masses[0], dampings[0]
-    set_plant(cycle["rendered"][0]["wall"][0], mass, viscous, spring, period)
-    cycle["rendered"]["wall"]["device_viscous"] = settings.mechanics.viscous_nm_s_per_rad
+    device = settings.mechanics.viscous_nm_s_per_rad
+    set_plant(cycle["rendered"][0]["wall"][0], mass, viscous, spring, period, device)
     cycle["rendered"]["law"] = NO_LAW
     set_wall(cycle, settings.wall, laws)
     return cycle
@@ -447,10 +447,9 @@ def set_wall(cycle: NDArray[np.void], wall: Wall, laws: Sequence[Law]) -> None:
     if wall.divider != rendered["divider"]:
         # The law's torques are held until it is evaluated again.
         rendered["divider"] = rendered["waited"] = wall.divider
-        mass, viscous, spring = (known[name].item() for name in ("mass", "viscous", "spring"))
-        device = known["device_viscous"].item()
-        set_plant(known, mass, viscous, spring, cycle["period"].item() * wall.divider)
-        known["device_viscous"] = device
+        names = ("mass", "viscous", "spring", "device_viscous")
+        mass, viscous, spring, device = (known[name].item() for name in names)
+        set_plant(known, mass, viscous, spring, cycle["period"].item() * wall.divider, device)
     set_referent(known, wall.stiffness_nm_per_rad, wall.damping_nm_s_per_rad, options)
     known["damping_ratio"], known["cap"] = wall.damping_ratio, wall.cap
     known["tension"] = TENSION[wall.tension]

@@ -292,9 +292,9 @@ class _Fit:
         return linear, covariance / np.outer(scale, scale), left[:samples]
 
     def viscous(self, x: Array) -> float:
-        """Return the viscous friction [N·m·s/rad]."""
+        """Return the viscous friction on an elastic shaft [N·m·s/rad]."""
         linear = self._everything(x)[0]
-        return max(float(linear[2 if len(x) > 2 else 1] / linear[0]), 0.0)
+        return max(float(linear[2] / linear[0]), 0.0)
 
     def result(self, x: Array, left_out: float) -> ServoFit:
         """Return the fit in physical units."""

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from canwall.config import Request
+from canwall.config import Request, Wall
 from canwall.errors import InputError, RunFailedError
 from canwall.panel.frames import Buckets, contact_frame
 from canwall.panel.launch import StartedRun
@@ -216,7 +216,7 @@ class Follower:
                 float(settings["rated_torque_nm"]) / 1000.0,
                 settings.get("handle_radius_m"),
                 [law["name"] for law in settings["laws"]],
-                -1.0 if settings["side"] == "above" else 1.0,
+                Wall(side=settings["side"]).orientation,
             )
         )
         self._buckets = Buckets(math.ceil(1.0 / cycle_s / _POINTS_HZ))

@@ -205,16 +205,23 @@ def call_law(typingctx: Any, address: Any, wall: Any) -> Any:
 
 
 def set_plant(
-    wall: NDArray[np.void], mass: float, viscous: float, spring: float, period: float
+    wall: NDArray[np.void],
+    mass: float,
+    viscous: float,
+    spring: float,
+    period: float,
+    device_viscous: float | None = None,
 ) -> None:
     """Write the plant and its zero-order-hold equivalent into a WALL array of shape (1,).
 
-    Mass, viscous damping and spring in SI units, linear or angular; period in s.
+    Mass, viscous damping and spring in SI units, linear or angular; period in s. device_viscous:
+    the part of the damping that is the device's. Default: all of it.
     """
     for name, value in (("mass", mass), ("viscous", viscous), ("spring", spring)):
         wall[name] = value
         wall["referent"][name] = value
-    wall["device_viscous"], wall["period"] = viscous, period
+    wall["device_viscous"] = viscous if device_viscous is None else device_viscous
+    wall["period"] = period
     wall["phi"], wall["gamma"] = zoh(mass, viscous, spring, period)
 
 
