@@ -94,7 +94,7 @@ class DelayTest:
         if k < self.cycles or not self.axis.settings.real_time:
             return k < self.cycles
         if self._fit is None:
-            self._fit = self._thread.submit(self.measured)
+            self._fit = self._thread.submit(self._prepared)
             self._thread.shutdown(wait=False)
         return not self._fit.done()
 
@@ -113,8 +113,17 @@ class DelayTest:
             delay = self._fit.result() if self._fit else self.measured()
         except ValueError as error:
             raise ExperimentError(axis, str(error)) from None
-        axis.delay = min(delay.value + delay.half, float(MAX_DELAY))
+        axis.delay = _upper_end(delay)
         set_delay(axis.cycle, axis.settings, axis.delay)
+
+    def _prepared(self) -> Delay:
+        """Return D, with the gains for it computed and kept.
+
+        They take a tenth of a second, and most of one on an elastic shaft.
+        """
+        delay = self.measured()
+        set_delay(self.axis.cycle.copy(), self.axis.settings, _upper_end(delay))
+        return delay
 
     def measured(self) -> Delay:
         """Return D. Raises ValueError if the motion does not tell it."""
@@ -126,6 +135,10 @@ class DelayTest:
             for part in self._parts
         ]
         return agreed_delay(found)
+
+
+def _upper_end(delay: Delay) -> float:
+    return min(delay.value + delay.half, float(MAX_DELAY))
 
 
 def agreed_delay(found: Sequence[Delay]) -> Delay:

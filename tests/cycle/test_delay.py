@@ -16,6 +16,7 @@ from canwall.cycle.delay import Delay, DelayTest, agreed_delay, excitation, meas
 from canwall.physics import zoh
 from canwall.record import Phase
 from canwall.walls import MAX_DELAY
+from canwall.walls.estimator import kalman_model
 
 COUNT = 2.0 * np.pi / 131072
 PERIOD = 1e-3
@@ -222,16 +223,18 @@ def test_lag_of_a_servo_that_nothing_tells(make_rig: RigFactory) -> None:
 
 
 def test_syncs_go_on_during_the_fit(make_rig: RigFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the clock, no watchdog waits for the fit; in simulated time none has to."""
+    """By the clock, no watchdog waits for the fit and its gains; in simulated time none has to."""
     fitting = threading.Event()
 
     def measured(test: DelayTest) -> Delay:
         assert fitting.wait(10.0)
-        return Delay(1.4, 0.1)
+        return Delay(1.4, 0.0371)
 
     monkeypatch.setattr(DelayTest, "measured", measured)
-    axis = Loop(make_rig(settings_with({"bus.pace": "real_time"}))).axis
+    adapting = {"bus.pace": "real_time", "operator.adapt": True}
+    axis = Loop(make_rig(settings_with(adapting))).axis
     test = DelayTest(axis)
+    kalman_model.cache_clear()
     for _ in range(test.cycles + 3):
         assert test.excite()
         test.note()
@@ -240,5 +243,7 @@ def test_syncs_go_on_during_the_fit(make_rig: RigFactory, monkeypatch: pytest.Mo
     deadline = time.monotonic() + 10.0
     while test.excite():
         assert time.monotonic() < deadline
+    computed = kalman_model.cache_info().misses
     test.conclude()
-    assert axis.delay == pytest.approx(1.5)
+    assert axis.delay == pytest.approx(1.4371)
+    assert kalman_model.cache_info().misses == computed > 0
