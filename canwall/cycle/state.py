@@ -129,7 +129,7 @@ CYCLE = np.dtype(
         ("estimator", ESTIMATOR, (1,)),
         ("bank", BANK, (1,)),
         ("latch", LATCH, (1,)),
-        ("shaft", "f8", (4,)),  # fields of ElasticShaft; zero: rigid
+        ("shaft", "f8", (5,)),  # fields of ElasticShaft; zero: rigid
         # The estimator for TPDOs that are a cycle late since one was missing, and the one for a
         # TPDO that was lost, both without the bank: while they are being compared, how much
         # likelier the first has been; the number of cycles that was found.
@@ -335,6 +335,7 @@ def _shaft(settings: Settings) -> ElasticShaft | None:
         mechanics.rotor_inertia_kg_m2,
         mechanics.shaft_hz,
         mechanics.shaft_damping_ratio,
+        mechanics.viscous_nm_s_per_rad,
     )
 
 

@@ -27,24 +27,31 @@ _LOOKED_AT: Array = np.geomspace(1e-4, 1.25, 100)
 
 
 class ElasticShaft(NamedTuple):
-    """A shaft between rotor and handle.
+    """A rotor, and the shaft between it and the handle.
 
     Attributes:
         inertia: Inertia of rotor and handle together, without a hand [kg·m²].
         rotor: That of the rotor [kg·m²].
         resonance_hz: Resonance of one against the other [Hz].
         damping_ratio: Its damping ratio.
+        viscous: Viscous damping of the rotor [N·m·s/rad].
     """
 
     inertia: float
     rotor: float
     resonance_hz: float
     damping_ratio: float
+    viscous: float
+
+    @property
+    def spring(self) -> tuple[float, float]:
+        """Stiffness [N·m/rad] and damping [N·m·s/rad] of the shaft."""
+        return shaft_spring(self.inertia, self.rotor, self.resonance_hz, self.damping_ratio)
 
     @property
     def stiffness(self) -> float:
         """Stiffness of the shaft [N·m/rad]."""
-        return shaft_spring(*self)[0]
+        return self.spring[0]
 
 
 class WallLoop(NamedTuple):
@@ -52,7 +59,7 @@ class WallLoop(NamedTuple):
 
     Attributes:
         mass: Inertia in the model of the laws [kg·m²].
-        viscous: Viscous damping in it [N·m·s/rad].
+        viscous: Viscous damping in it, that of the rotor included [N·m·s/rad].
         gain: Gain of its filter on [y, ẏ, d].
         sampled: True for a law that goes by the sampled position.
         damping: B that is asked for [N·m·s/rad].
@@ -173,10 +180,12 @@ def _two_masses(
     """Return transition and effect of a torque on position and velocity of rotor and load."""
     from scipy.linalg import expm  # a tenth of a second: not for rigid shafts
 
-    stiffness, damping = shaft_spring(*shaft)
+    stiffness, damping = shaft.spring
+    hand = viscous - shaft.viscous
     rates = np.zeros((5, 5))
     rates[0, 1] = rates[2, 3] = 1.0
-    rates[1, :5] = np.array([-stiffness, -damping, stiffness, damping, 1.0]) / shaft.rotor
-    rates[3, :4] = np.array([stiffness, damping, -stiffness, -damping - viscous]) / load
+    rates[1, :5] = np.array([-stiffness, -damping - shaft.viscous, stiffness, damping, 1.0])
+    rates[1] /= shaft.rotor
+    rates[3, :4] = np.array([stiffness, damping, -stiffness, -damping - hand]) / load
     over = expm(rates * duration)
     return over[:4, :4], over[:4, 4]

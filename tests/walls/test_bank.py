@@ -751,7 +751,7 @@ def test_no_trend_on_an_elastic_shaft() -> None:
     bank, _ = bank_at(0.0)
     light = MASSES / MASSES[0] <= 3.0
     assert np.all(bank["gain_in_flight"][0, 0, :16][light] > 0.0)
-    shaft = ElasticShaft(1e-4, 0.6e-4, 400.0, 0.02)
+    shaft = ElasticShaft(1e-4, 0.6e-4, 400.0, 0.02, 0.0)
     set_bank(bank, MASSES, VISCOUS, 0.0, PERIOD, COUNT, WALK, DELAY, shaft)
     assert np.all(bank["gain_in_flight"] == 0.0)
     assert np.all(bank["trend_gain"] == 0.0)
