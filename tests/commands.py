@@ -40,7 +40,7 @@ ON_A_BUSY_MACHINE = {
 SOFT_WALL = {
     "stiffness_nm_per_rad = 50.0": "stiffness_nm_per_rad = 0.5",
     'law = "mean_force"': 'law = "standard"',
-    "cap = 0.8\n": "",
+    "cap = 0.8": "cap = 0",
 }
 
 #: What a run of config/sim.toml or its like says of the strikes on the plain wall.
