@@ -51,12 +51,7 @@ def two_masses(load: float, hz: float, duration: float) -> tuple[Array, Array]:
             [0.0, 1.0, 0.0, 0.0],
             [-stiffness / ROTOR, -(damping + DRIVE) / ROTOR, stiffness / ROTOR, damping / ROTOR],
             [0.0, 0.0, 0.0, 1.0],
-            [
-                stiffness / load,
-                damping / load,
-                -stiffness / load,
-                -(damping + VISCOUS - DRIVE) / load,
-            ],
+            [stiffness / load, damping / load, -stiffness / load, -(damping + hand) / load],
         ]
     )
     b = np.array([[0.0], [1.0 / ROTOR], [0.0], [0.0]])
