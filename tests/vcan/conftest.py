@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from commands import Record
-from rig import Loop, Rig, settings_with
+from rig import SIM_CONFIG, Loop, Rig, settings_with
 from socketcan import (
     PATIENCE_S,
     Bench,
@@ -21,6 +21,7 @@ from socketcan import (
     wait_for,
 )
 
+from canwall import config
 from canwall.run import run
 from canwall.simdrive import load_compiled_code
 
@@ -58,7 +59,7 @@ def loaded(tmp_path_factory: pytest.TempPathFactory) -> None:
         for real_time in (False, True):
             load_compiled_code(real_time)
         with light():
-            settings = settings_with({"run.duration_s": 0.3})
+            settings = config.load(SIM_CONFIG, {"run.duration_s": 0.3})
             run(settings, tmp_path_factory.mktemp("loaded") / "run")
 
 

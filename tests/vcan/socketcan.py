@@ -161,6 +161,7 @@ def light() -> Iterator[None]:
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(canwall.record.Recorder, "draw", lambda recorder, given_up: [])
+        patch.setattr(canwall.record.writer, "_prepare_to_draw", lambda ended: None)
         patch.setattr(canwall.record.recorder.subprocess, "Popen", _ForkedWriter)
         patch.setattr(canwall.cycle.way_out, "_STANDSTILL_S", 60.0)
         yield
