@@ -3,10 +3,10 @@
 Two signs, of the position and of the force in force alone, so that neither model nor operator need
 be known:
 
-- **Ripple that does not decay.** The force within 20 to 500 Hz (docs/results.md) has swung a
-  dozen times by more than RIPPLE_NM: within 100 ms of which no 20 ms were much quieter than the
-  others, or within 200 ms without falling to half. A bounce dies away. While the force is lowered,
-  half of either time is enough.
+- **Ripple that does not decay.** The force within 20 to 500 Hz (docs/results.md) has swung by more
+  than RIPPLE_NM: a dozen times within 100 ms of which no 20 ms were much quieter than the others,
+  or eight times, as the slowest of the band does, within 200 ms without falling to half. A bounce
+  dies away. While the force is lowered, half of either is enough.
 - **A contact that gives off more than it took.** The wall has put out more energy than the operator
   put in, and the handle leaves faster than it came. Either alone is no sign: a hand that withdraws
   leaves faster, and on a soft wall friction takes what sampling adds. While the force is lowered,
@@ -37,7 +37,7 @@ BLOCK_S = 0.02
 STEADY_BLOCKS, STEADY = 5, 0.6
 #: ... or for this many, with this of the largest peak in each; swings in all of them.
 LASTING_BLOCKS, LASTING = 10, 0.5
-SWINGS = 12
+STEADY_SWINGS, LASTING_SWINGS = 12, 8
 #: Energy given off in a contact over that taken in; speed out over speed in, and as long as the
 #: force is lowered.
 GAIN, FASTER, AGAIN = 0.2, 1.1, 0.8
@@ -229,9 +229,10 @@ def _ripples(guard: Record, force: float) -> bool:
     # A wall that has been softened and buzzes on is not given as long again.
     sooner = 2 if guard.factor < 1.0 else 1
     steady, lasting = STEADY_BLOCKS // sooner, LASTING_BLOCKS // sooner
-    blocks, swings = guard.filled // guard.block, SWINGS // sooner
-    return (blocks >= steady and _lasts(guard, guard.amplitudes, steady, STEADY, swings)) or (
-        blocks >= lasting and _lasts(guard, guard.peaks, lasting, LASTING, swings)
+    often, seldom = STEADY_SWINGS // sooner, LASTING_SWINGS // sooner
+    blocks = guard.filled // guard.block
+    return (blocks >= steady and _lasts(guard, guard.amplitudes, steady, STEADY, often)) or (
+        blocks >= lasting and _lasts(guard, guard.peaks, lasting, LASTING, seldom)
     )
 
 

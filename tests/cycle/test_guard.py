@@ -81,9 +81,17 @@ def test_ripple_that_stays(frequency: float) -> None:
     assert silent["alarms"][0] == 0
 
 
-def test_slow_ripple_within_200_ms() -> None:
-    factors = watched(made(), np.full(600, -0.01), ripple(35.0, 0.1))
+@pytest.mark.parametrize("frequency", [22.0, 27.0, 35.0])
+def test_slow_ripple_within_200_ms(frequency: float) -> None:
+    inside = np.full(600, -0.01)
+    factors = watched(made(), inside, ripple(frequency, 0.15))
     assert 190 <= int(np.flatnonzero(factors < 1.0)[0]) <= 240
+    assert (watched(made(), inside, ripple(frequency, 0.5, 0.1)) == 1.0).all()
+
+
+def test_push_to_and_fro_is_no_ripple() -> None:
+    """A hand does not push as fast as the slowest of the band."""
+    assert (watched(made(), np.full(600, -0.01), ripple(12.0, 0.15)) == 1.0).all()
 
 
 def test_a_step_and_a_steady_push_are_no_ripple() -> None:
