@@ -6,8 +6,8 @@ finds (`regression`), at the delay that it finds. The gains of the filters are m
 known has a bank of one filter: it holds its mass, and finds the delay.
 
 The bank works on an estimator in its steady state and hands over state and model to it. In a gap
-of samples, and until the estimator has settled again, the estimator goes on alone and the bank
-follows it.
+of samples, and until the estimator has nearly settled again, the estimator goes on alone and the
+bank follows it.
 """
 
 import math
@@ -24,7 +24,7 @@ from canwall.walls.bank_gains import (
     set_filters,
     stiffest_walls,
 )
-from canwall.walls.estimator import MAX_DELAY, set_model, set_model_delay
+from canwall.walls.estimator import MAX_DELAY, set_model, set_model_delay, settle_within
 from canwall.walls.probe import (
     PROBE,
     other_torque_acts,
@@ -139,6 +139,8 @@ BANK = np.dtype(
     align=True,
 )
 
+#: Share of its gain within which the estimator has nearly settled: meanwhile nothing is identified.
+_SETTLED = 0.01
 #: Time without torque after which another hand may be at the handle [s].
 _FORGOTTEN_S = 0.2
 #: Share of the way to the likeliest mass that is gone in a period.
@@ -255,7 +257,7 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
     n = bank.count
     state, gain = bank.state, bank.gain
     bank.regression[0].delay = estimator.told
-    if not estimator.settled:
+    if not estimator.settled and not settle_within(estimator, _SETTLED):
         follow_estimator(bank, estimator)
         bank.equal = bank.alone = bank.pressed = 0
         bank.flies = bank.presses = False

@@ -301,6 +301,18 @@ def _correct_covariance(estimator: Record) -> None:
 
 
 @compiled
+def settle_within(estimator: Record, share: float) -> bool:
+    """Return to the steady state if the gain is within a share of its own; True if it is there."""
+    for i in range(3):
+        steady = estimator.steady_gain[i]
+        if not abs(estimator.gain[i] - steady) <= share * abs(steady):
+            return False
+    estimator.settled = True
+    estimator.gain[:] = estimator.steady_gain
+    return True
+
+
+@compiled
 def _predict_covariance(estimator: Record) -> None:
     """Advance the covariance to the next sample, A·P·Aᵀ + Q."""
     a, p = estimator.transition, estimator.covariance

@@ -12,6 +12,7 @@ from canwall.analysis import metrics
 from canwall.config import Settings
 from canwall.cycle import Trip
 from canwall.run.closed_loop import Disturbances, SimulatedRun, simulate
+from canwall.sweep.strike import strike_settings
 
 DURATION_S = 4.2
 #: Periods [s], and the stiffest wall of half_sample on a usual grid that holds in them.
@@ -170,6 +171,21 @@ def test_tpdos_that_are_in_time_again(end: float) -> None:
     quiet = simulate(settings, cycles)
     last = slice(3150, 3600)
     assert np.abs(run.rows["y_est"][last] - quiet.rows["y_est"][last]).max() < 1e-3
+
+
+@pytest.mark.parametrize("before", [12, 17, 20])
+def test_hand_is_found_in_spite_of_a_tpdo_that_is_lost_just_before_the_contact(before: int) -> None:
+    """Neither probe nor contact tells of it until the estimator has settled again."""
+    hand = {"inertia_kg_m2": 1.28e-3, "damping_nm_s_per_rad": 0.0416, "stiffness_nm_per_rad": 2.56}
+    given = {"operator.adapt": True, "wall.law": "mean_force", "wall.damping_ratio": 0.5}
+    settings, _ = wall(1e-3, 138.0, hand, **given)
+    settings = strike_settings(settings, 1.0, 0.3, 0.02, 0.1, 0.15)
+    cycles = 200
+    rows = simulate(settings, cycles).rows
+    disturbances = Disturbances.none(cycles)
+    disturbances.lost[int(np.flatnonzero(rows["y"] < 0.0)[0]) - before] = True
+    lost = simulate(settings, cycles, disturbances=disturbances).rows
+    assert lost["y"].min() > 2.5 * rows["y"].min()
 
 
 @pytest.mark.parametrize("begin", [330, 700])
