@@ -30,7 +30,7 @@ def trip_text(axis: WallAxis, exchange: Exchange) -> str:
     trip = Trip(int(cycle["trip"]))
     match trip:
         case Trip.SPEED:
-            speed = float(cycle["estimator"]["v"][0])
+            speed = float(cycle["orientation"] * cycle["estimator"]["v"][0])
             what = f"speed {speed:.3g} rad/s beyond limits.speed_rad_s"
         case Trip.POSITION:
             what = f"position {float(row['position_rad']):.4g} rad outside limits.position_rad"

@@ -51,6 +51,14 @@ def test_trip_after_missing_tpdos_names_them(make_rig: RigFactory, trip: Trip) -
     assert encoder not in said
 
 
+@pytest.mark.parametrize("side", ["below", "above"])
+def test_speed_is_that_of_the_drive_s_axis(make_rig: RigFactory, side: str) -> None:
+    loop = Loop(make_rig(settings_with({"wall.side": side})))
+    loop.record["trip"] = Trip.SPEED
+    loop.record["estimator"]["v"] = 70.0 * loop.axis.settings.wall.orientation
+    assert "speed 70 rad/s" in trip_text(loop.axis, loop.exchange)
+
+
 def test_late_tpdos_are_named_where_none_came_in_time(make_rig: RigFactory) -> None:
     settings = settings_with()
     bus = settings.bus.model_copy(update={"pace": "real_time"})
