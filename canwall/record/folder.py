@@ -172,7 +172,8 @@ class RunFolder:
         """Create the folder of one run, by default `runs/<date and time>` here.
 
         Args:
-            path: The folder; it may exist and hold other files.
+            path: The folder; it may exist and hold other files. What a run has left in it that
+                failed before its first cycle is replaced.
             config: Content of config.toml. Who creates that file has the folder.
             bus_log: Path of the bus log, relative to the folder.
 
@@ -183,6 +184,7 @@ class RunFolder:
         folder = cls(path or cls.default_path())
         try:
             folder.path.mkdir(parents=True, exist_ok=True)
+            folder._remove_empty_record(bus_log)
             for file in folder._files(bus_log):
                 if os.path.lexists(file):
                     raise _taken(file)
@@ -192,6 +194,14 @@ class RunFolder:
                 f"{folder.path}: cannot be written: {reason(error)}; choose another --output"
             ) from None
         return folder
+
+    def _remove_empty_record(self, bus_log: str) -> None:
+        with contextlib.suppress(ConfigError, FileNotFoundError):
+            if read_signals(self.signals).num_rows or os.path.lexists(self.summary):
+                return
+            self.signals.unlink()  # first: of several runs that begin here, only one goes on
+            self.config.unlink(missing_ok=True)
+            (self.path / bus_log).unlink(missing_ok=True)
 
     def _claim(self, config: str) -> None:
         """Write config.toml, unless another run has done so meanwhile."""

@@ -372,6 +372,15 @@ def test_nothing_is_written_through_a_symbolic_link(tmp_path: Path, name: str) -
     assert not foreign.exists()
 
 
+def test_what_a_run_without_a_cycle_has_left_is_replaced(tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path, "of the first", "bus.blf")
+    (tmp_path / "bus.blf").touch()
+    pq.write_table(schema(LAWS).empty_table(), folder.signals)
+    RunFolder.create(tmp_path, "of the second", "bus.blf")
+    assert [path.name for path in tmp_path.iterdir()] == ["config.toml"]
+    assert folder.config.read_text() == "of the second"
+
+
 def test_bus_log_of_several_drives_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "bus.log").write_text("a thesis")
     with pytest.raises(ConfigError, match=r"holds bus\.log already"):
