@@ -196,15 +196,21 @@ _TOML_TYPES = {
 
 
 def first_error(error: ValidationError, model: type[BaseModel] = Settings) -> str:
-    """Return one line about the first error: key, what is wrong, what to do."""
-    first = error.errors()[0]
+    """Return one line about the first error: key, what is wrong, what to do.
+
+    If a key is missing, it tells all that are missing beside it.
+    """
+    first, *others = error.errors()
     where = [str(part) for part in first["loc"]]
     key = ".".join(where)
     given = first["input"]
     if first["type"] == "extra_forbidden":
         return f"{key}: unknown key{_suggestion(where, model)}"
     if first["type"] == "missing":
-        return f"{key}: is missing; add it"
+        missing = [e["loc"] for e in others if e["type"] == "missing"]
+        beside = [".".join(map(str, loc)) for loc in missing if loc[:-1] == first["loc"][:-1]]
+        what = "are missing; add them" if beside else "is missing; add it"
+        return f"{', '.join([key, *beside])}: {what}"
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
     if not key:
         return message

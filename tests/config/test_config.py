@@ -149,6 +149,10 @@ REFUSED: list[tuple[dict[str, object], str]] = [
     ({"limits": None}, "limits: is missing; add it"),
     ({"drive.node_id": None}, "drive.node_id: is missing; add it"),
     ({"drive.eds": None}, "drive.eds: is missing; add it"),
+    (
+        {"drive.node_id": None, "drive.eds": None, "limits.torque_nm": None},
+        "drive.node_id, drive.eds: are missing; add them",
+    ),
     ({"schedule": [{"law": "damped"}]}, "schedule.0.at_s: is missing; add it"),
     # what is unknown
     ({"walll.law": "x"}, "walll: unknown key; did you mean wall?"),
@@ -315,7 +319,7 @@ def test_what_is_not_text(file: Path) -> None:
 
 def test_an_empty_file(file: Path) -> None:
     file.touch()
-    assert refused(file) == "drive: is missing; add it"
+    assert refused(file) == "drive, mechanics, limits: are missing; add them"
 
 
 toml_values = st.recursive(
