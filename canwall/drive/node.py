@@ -237,7 +237,7 @@ class DriveNode:
         if not others:
             return (
                 f"{silent}, nor does any other; is the drive on, on this bus, at this bit rate, "
-                f"and is drive.node_id right?"
+                "and is drive.node_id right? `canwall drive CONFIG` simulates one"
             )
         listed = ", ".join(str(node_id) for node_id in others)
         do = f"node {listed} does" if len(others) == 1 else f"nodes {listed} do"
