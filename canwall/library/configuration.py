@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from canwall import config as settings_room
-from canwall.config import Settings
+from canwall.config import ConfigError, Settings
 from canwall.library.laws import LawLike, law_name
 from canwall.walls import Law
 
@@ -33,7 +33,13 @@ def load(config: Config = None, overrides: Mapping[str, Any] | None = None) -> S
     if isinstance(config, Settings):
         settings = config
     else:
-        path = settings_room.shipped("config/sim.toml") if config is None else Path(config)
+        try:
+            path = settings_room.shipped("config/sim.toml") if config is None else Path(config)
+        except TypeError:
+            raise ConfigError(
+                f"a configuration is a path or settings, not {type(config).__name__}; give values "
+                "by dotted key as overrides"
+            ) from None
         settings = settings_room.load(path)
     if not overrides:
         return settings

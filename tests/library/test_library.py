@@ -94,6 +94,11 @@ def test_what_cannot_be_loaded_is_an_input_error(overrides: dict[str, Any], comp
         canwall.load(None, overrides)
 
 
+def test_a_dictionary_is_no_configuration() -> None:
+    with pytest.raises(InputError, match="path or settings, not dict; give values by dotted key"):
+        canwall.load({"wall.law": "midpoint"})  # type: ignore[arg-type]
+
+
 # Runs
 
 
