@@ -185,13 +185,14 @@ def short_law(law: str) -> str:
     return f"{Path(path).name}:{function}" if colon else law
 
 
-# Names of types in TOML, by the pydantic errors that use Python's names.
+# What a value has to be, by the pydantic errors that say it in Python's words.
 _TOML_TYPES = {
     "model_type": "a table",
     "dict_type": "a table",
     "tuple_type": "an array",
     "too_long": "a pair",
     "is_instance_of": "a path in quotes",
+    "string_too_short": "a text that is not empty",
 }
 
 
@@ -212,14 +213,14 @@ def first_error(error: ValidationError, model: type[BaseModel] = Settings) -> st
         what = "are missing; add them" if beside else "is missing; add it"
         return f"{', '.join([key, *beside])}: {what}"
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
-    if not key:
-        return message
+    begin = f"{key}: " if key else ""
     if first["type"] == "value_error":
-        return f"{key}: {message}"
+        return f"{begin}{message}"
     hint = ""
     if first["type"] == "literal_error" and isinstance(given, str):
         hint = did_you_mean(given, re.findall(r"'([^']*)'", first["ctx"]["expected"]))
-    return f"{key}: has to be {_TOML_TYPES.get(first['type'], message)}, not {_format(given)}{hint}"
+    expected = _TOML_TYPES.get(first["type"], message)
+    return f"{begin}has to be {expected}, not {_format(given)}{hint}"
 
 
 def _format(value: object) -> str:

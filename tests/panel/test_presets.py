@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from canwall.config import ConfigError, WallChange
+from canwall.panel.messages import validated
 from canwall.panel.presets import Presets, default_path
 
 SOFT = WallChange(stiffness_nm_per_rad=5.0, damping_ratio=0.5)
@@ -29,7 +30,7 @@ def test_presets_are_there_for_the_next_one(tmp_path: Path) -> None:
     [
         (b"[soft", "not valid TOML"),
         (b"\xff", "not valid TOML"),
-        (b"soft = 1", "preset soft"),
+        (b"soft = 1", "preset soft: has to be a table, not 1"),
         (b"[soft]\nstiffness = 1", "preset soft: stiffness: unknown key"),
         (b"[soft]\nstiffness_nm_per_rad = -1", "has to be"),
         (b'[soft]\nlaw = "\\u0000"', "NUL"),
@@ -56,6 +57,11 @@ def test_names_and_folders_that_cannot_be(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="cannot be"):
         Presets(tmp_path / "file" / "p.toml").save("a", SOFT)
+
+
+def test_a_request_without_a_name() -> None:
+    with pytest.raises(ConfigError, match="name: has to be a text that is not empty, not ''"):
+        validated({"do": "preset_save", "name": ""})
 
 
 def test_the_users_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
