@@ -142,6 +142,10 @@ def _strike(
     if verdict.chatters:
         settles = referent is not None and judged.stop > judged.start
         amplitude, frequency = metrics.limit_cycle(y[judged] if settles else inside, period)
+        if verdict.by == "counts" and not settles:  # the whole contact has the hand's motion
+            window = metrics.event_window(period)
+            events = metrics.busiest_window(y[seen], window, units.rad_per_count)
+            frequency = events / (2.0 * window * period)
     if verdict.by == "ripple":  # it may be felt within one count
         _, frequency = metrics.limit_cycle(force[judged], period)
     around = slice(max(start - 2 * SPAN, 0), cycles.stop + SPAN)

@@ -70,6 +70,16 @@ def test_chatter_is_that_of_the_settled_part() -> None:
     assert strike["chatter_frequency_hz"] == pytest.approx(FREQUENCY_HZ, rel=0.01)
 
 
+def test_chatter_of_a_contact_that_does_not_settle_is_that_of_its_makes_and_breaks() -> None:
+    """The time between two bursts is no part of the oscillation."""
+    y = pressed()
+    for burst in (REST + 200, OUT - 300):
+        y[burst : burst + 100 : 20] = 5.0 * COUNT
+    (strike,) = summary_of(y, np.where(y < 0.0, 1.0, 0.0), known=False)["strikes"]
+    assert (strike["chatter_by"], strike["contacts"]) == ("counts", 11)
+    assert strike["chatter_frequency_hz"] == 25.0
+
+
 def test_laws_are_those_that_were_in_force() -> None:
     """Laws that take turns or come by a request are not in the configuration's stages."""
     y, j = pressed(), np.arange(END)
