@@ -457,9 +457,10 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     row.controlword = cycle.controlword
     row.position_rad = cycle.counts * cycle.rad_per_count
     row.y = wall.y_sample
-    row.y_est = wall.y
-    row.v_est = wall.v
-    row.d_est = wall.d
+    # To the estimator the first position of all is a jump.
+    row.y_est = wall.y if cycle.started else wall.y_sample
+    row.v_est = wall.v if cycle.started else 0.0
+    row.d_est = wall.d if cycle.started else 0.0
     row.force = demanded
     row.torque_cmd_per_mille = per_mille
     row.torque_cmd = torque

@@ -168,6 +168,12 @@ def test_row_of_a_cycle() -> None:
     assert row["wall_position_rad"] == 0.01
 
 
+def test_first_position_is_no_motion() -> None:
+    wall = Wall()
+    wall.at(20)
+    assert [wall.row[name][0] for name in ("y", "y_est", "v_est", "d_est")] == [0.02, 0.02, 0.0, 0.0]
+
+
 @pytest.mark.parametrize("phase", [Phase.ENABLING, Phase.LEAVING])
 def test_no_torque_but_while_rendering(phase: Phase) -> None:
     wall = Wall()
