@@ -434,10 +434,11 @@ class Settings(Section):
     def laws_in_turn(self, wall: Wall) -> list[Wall]:
         """Return the walls that alternate from strike to strike, `wall` first.
 
-        Options belong to the law of `wall`; the laws in `alternate` have their defaults.
+        Options and deadbeat compensation belong to the law of `wall`; the laws in `alternate` have
+        their defaults, and the compensation if `+deadbeat` is in their names.
         """
-        others = [wall.model_copy(update={"law": law, "options": {}}) for law in wall.alternate]
-        return [wall, *others]
+        own = {"options": {}, "deadbeat": False}
+        return [wall, *(wall.model_copy(update=own | {"law": law}) for law in wall.alternate)]
 
     def with_ideal_servo(self) -> Self:
         """Return the same with an ideal simulated servo, of which the model of the laws knows."""

@@ -171,7 +171,12 @@ def test_row_of_a_cycle() -> None:
 def test_first_position_is_no_motion() -> None:
     wall = Wall()
     wall.at(20)
-    assert [wall.row[name][0] for name in ("y", "y_est", "v_est", "d_est")] == [0.02, 0.02, 0.0, 0.0]
+    assert [wall.row[name][0] for name in ("y", "y_est", "v_est", "d_est")] == [
+        0.02,
+        0.02,
+        0.0,
+        0.0,
+    ]
 
 
 @pytest.mark.parametrize("phase", [Phase.ENABLING, Phase.LEAVING])
