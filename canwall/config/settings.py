@@ -23,8 +23,9 @@ from canwall.config.section import (
 from canwall.config.simulation import Simulation
 from canwall.config.sweep import AxisValues
 
-#: What the model knows of an ideal drive.
+#: What the model knows of an ideal servo, in [drive] and in [mechanics].
 _IDEAL_DRIVE = {"drive_cycle_s": 0.0, "current_bandwidth_hz": 0.0}
+_IDEAL_MECHANICS = {"shaft_hz": 0.0}
 
 #: Rest between the two parts of the measurement of the delay [cycles].
 _REST_CYCLES = 50
@@ -347,6 +348,8 @@ class Settings(Section):
         if not (ideal and isinstance(drive, dict)):
             return values
         values = values | {"drive": drive | _IDEAL_DRIVE}
+        if isinstance(mechanics := values.get("mechanics"), dict):
+            values["mechanics"] = mechanics | _IDEAL_MECHANICS
         estimator = values.get("estimator", {})
         if isinstance(estimator, dict) and estimator.get("measure_delay", "auto") == "auto":
             values["estimator"] = estimator | {"measure_delay": False}
@@ -442,9 +445,12 @@ class Settings(Section):
 
     def with_ideal_servo(self) -> Self:
         """Return the same with an ideal simulated servo, of which the model of the laws knows."""
-        drive = self.drive.model_copy(update=_IDEAL_DRIVE)
-        simulation = self.simulation and self.simulation.with_ideal_servo()
-        return self.model_copy(update={"drive": drive, "simulation": simulation})
+        update = {
+            "drive": self.drive.model_copy(update=_IDEAL_DRIVE),
+            "mechanics": self.mechanics.model_copy(update=_IDEAL_MECHANICS),
+            "simulation": self.simulation and self.simulation.with_ideal_servo(),
+        }
+        return self.model_copy(update=update)
 
     def without_replacements(self, *, law: bool, damping: bool) -> Self:
         """Return the same without what would replace a given law, or a given damping.

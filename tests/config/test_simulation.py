@@ -33,6 +33,14 @@ def test_ideal_is_one_thing_by_key_and_by_method() -> None:
     assert Simulation.model_validate(by_key.model_dump()) == by_key
 
 
+def test_model_of_an_ideal_servo_has_no_shaft() -> None:
+    shaft = {"mechanics.shaft_hz": 400.0, "mechanics.rotor_inertia_kg_m2": 1e-5}
+    by_key = settings_with(shaft | {"simulation.ideal": True})
+    by_method = settings_with(shaft | {"simulation.ideal": False}).with_ideal_servo()
+    assert by_key.mechanics == by_method.mechanics
+    assert by_key.mechanics.shaft_hz == 0.0
+
+
 @pytest.mark.parametrize(
     ("drive", "simulation", "expected"),
     [

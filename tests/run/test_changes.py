@@ -288,7 +288,7 @@ def test_change_that_the_wall_in_force_does_not_allow_is_refused(
 def test_divider_is_judged_as_that_of_a_configuration(make_rig: RigFactory, tmp_path: Path) -> None:
     """The bound of a cap on an elastic shaft is that of a law in every cycle."""
     shaft = {"mechanics.shaft_hz": 300.0, "mechanics.rotor_inertia_kg_m2": 1e-5}
-    bench = Bench(make_rig, tmp_path, shaft)
+    bench = Bench(make_rig, tmp_path, shaft | {"simulation.ideal": False})
     requests = {
         300: lambda: bench.ask("divider=2"),
         400: lambda: bench.ask("cap=0.8"),
