@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from canwall.cli.options import JsonOption, absolute_path, settings_from
-from canwall.cli.output import console, print_json, say
+from canwall.cli.output import console, print_json, print_text, say
 from canwall.errors import InputError
 
 if TYPE_CHECKING:
@@ -182,7 +182,7 @@ def config(
         return 0
     text = config.portable_text(config.named(name))
     if output is None:
-        typer.echo(text, nl=False)
+        print_text(text, end="")
         return 0
     _refuse_to_overwrite(output, force)
     _write(output, text)

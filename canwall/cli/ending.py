@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import typer
 
-from canwall.cli.output import say
+from canwall.cli.output import console, say
 from canwall.errors import InputError, RunFailedError, did_you_mean, one_line
 
 #: Exit codes: a run that failed or tripped, bad input, Ctrl-C with the drive disabled.
@@ -24,7 +24,7 @@ def guarded(command: Callable[[], object]) -> int:
         code = _tell(error)
         # Notes say what could not be put in order after it.
         return failed_if(getattr(error, "__notes__", ())) or code
-    return result if isinstance(result, int) else 0
+    return (result if isinstance(result, int) else 0) or (FAILED if console.has_lost else 0)
 
 
 def failed_if(troubles: Iterable[str]) -> int:

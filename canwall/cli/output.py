@@ -10,7 +10,13 @@ from canwall.strict_json import as_json
 
 
 class _LastingConsole(Console):
-    """Console that outlasts its file: a full disk or a closed pipe does not end a command."""
+    """Console that outlasts its file: a full disk or a closed pipe does not end a command.
+
+    Attributes:
+        has_lost: True once a result could not be written; who closes a pipe has read enough.
+    """
+
+    has_lost = False
 
     def print(self, *objects: Any, **options: Any) -> None:
         try:
@@ -21,6 +27,7 @@ class _LastingConsole(Console):
             os.dup2(nowhere, 2 if self.stderr else 1)
             os.close(nowhere)
             if not self.stderr and not isinstance(error, BrokenPipeError):
+                self.has_lost = True
                 say(f"standard output cannot be written: {error.strerror}")
 
     def on_broken_pipe(self) -> None:
@@ -39,7 +46,12 @@ def say(text: str) -> None:
 
 def print_json(content: Any) -> None:
     """Print a result as a line of JSON on standard output; what is no finite number is null."""
-    console.print(as_json(content), soft_wrap=True, highlight=False, markup=False, emoji=False)
+    print_text(as_json(content))
+
+
+def print_text(text: str, end: str = "\n") -> None:
+    """Print a text on standard output as it is."""
+    console.print(text, end=end, soft_wrap=True, highlight=False, markup=False, emoji=False)
 
 
 class ProgressDisplay:

@@ -9,7 +9,7 @@ import typer
 
 from canwall.cli.ending import StoppedError
 from canwall.cli.options import ConfigArgument, JsonOption, LawsOption, settings_from
-from canwall.cli.output import ProgressDisplay, console, print_json, say
+from canwall.cli.output import ProgressDisplay, console, print_json, print_text, say
 from canwall.errors import InputError, RunFailedError
 from canwall.extras import need
 from canwall.stopping import stop_on_signals
@@ -87,7 +87,7 @@ def sweep(
         if as_json:
             print_json(dataset.to_dict())
         else:
-            print(format_law_table(dataset))
+            print_text(format_law_table(dataset))
         return 0
     if output is None:
         raise InputError("--output is missing: give the FILE.nc of the result")

@@ -2,6 +2,7 @@
 
 import io
 import json
+import shlex
 import subprocess
 import sys
 from importlib.metadata import version
@@ -11,7 +12,7 @@ from typing import Any
 import pytest
 import typer
 import xarray as xr
-from commands import PATIENCE_S, Record, command, config_file
+from commands import COMMAND, PATIENCE_S, Record, command, config_file
 from rich.table import Table
 
 from canwall import cli, config
@@ -205,6 +206,15 @@ def test_json_has_what_json_allows(capfd: pytest.CaptureFixture[str]) -> None:
     assert json.loads(line) == {
         **{"a": None, "b": [1.0, None], "p": "x/:car:", "c": "[red]µ", "l": "x" * 300}
     }
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", ["config", "config sim"])
+def test_result_that_cannot_be_written(words: str) -> None:
+    line = f"exec {shlex.quote(COMMAND)} {words} >/dev/full"
+    done = subprocess.run(["sh", "-c", line], capture_output=True, text=True, timeout=PATIENCE_S)
+    told = "canwall: standard output cannot be written: No space left on device\n"
+    assert (done.returncode, done.stderr) == (1, told)
 
 
 def test_ball_as_json(run: Run, tmp_path: Path) -> None:

@@ -252,18 +252,20 @@ def test_streams_that_are_closed_at_start(tmp_path: Path, closed: str) -> None:
 @pytest.mark.slow
 def test_output_that_cannot_be_written(tmp_path: Path) -> None:
     line = f'exec {shlex.quote(COMMAND)} run --duration 0.1 --output "$0"'
-    for n, (streams, said) in enumerate(
+    told = ["canwall: standard output cannot be written: No space left on device"]
+    for n, (streams, code, said) in enumerate(
         [
-            (">/dev/full", ["canwall: standard output cannot be written: No space left on device"]),
-            (">/dev/full 2>/dev/full", []),
-            ("| true", []),
+            (">/dev/full", 1, told),
+            ("--json >/dev/full", 1, told),
+            (">/dev/full 2>/dev/full", 1, []),
+            ("| true", 0, []),
         ]
     ):
         words = ["bash", "-o", "pipefail", "-c", f"{line} {streams}", str(tmp_path / f"run{n}")]
         if streams.startswith("|"):
             words[4] = words[4].removeprefix("exec ")
         done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE_S)
-        assert (done.returncode, without_compiling(done.stderr)) == (0, said)
+        assert (done.returncode, without_compiling(done.stderr)) == (code, said)
         assert Record(tmp_path / f"run{n}").summary["cycles"] > 100
 
 
