@@ -52,8 +52,8 @@ class RepeatableStrike(Protocol):
 def k_limits(strikes: Sequence[RepeatableStrike], damping: float) -> NDArray[np.void]:
     """Search the K-limit of each strike, and a stiffness up to which none of them chatters.
 
-    The worst K-limit may be below the smallest limit of a single strike: each is found on steps of
-    its own.
+    Walls too soft to hold the hand are passed over where they trip. The worst K-limit may be below
+    the smallest limit of a single strike: each is found on steps of its own.
 
     Args:
         strikes: Strikes with the same mass and period.
@@ -69,7 +69,8 @@ def k_limits(strikes: Sequence[RepeatableStrike], damping: float) -> NDArray[np.
     worst = limits["limit"].min()
     while worst > 0.0:
         measures = [strike.on(worst, damping) for strike in strikes]
-        if not any(m["chatters"] for m in measures):
+        seen = zip(strikes, measures, strict=True)
+        if not any(m["chatters"] and not _is_too_soft(strike, worst, m) for strike, m in seen):
             for name in MEASURES.names or ():
                 limits[name] = [m[name] for m in measures]
             break
@@ -83,10 +84,13 @@ def k_limits(strikes: Sequence[RepeatableStrike], damping: float) -> NDArray[np.
     return limits
 
 
+def _is_too_soft(strike: RepeatableStrike, stiffness: float, measures: np.void) -> bool:
+    """Return True if a wall that does not hold the hand has tripped."""
+    return bool(stiffness < strike.softest and measures["trip"])
+
+
 def scan(strike: RepeatableStrike, unit: float, damping: float) -> tuple[float, bool]:
     """Scan walls upwards until one chatters: by FACTOR, and anew in finer steps before that one.
-
-    Walls too soft to hold the hand are passed over where they trip.
 
     Args:
         strike: The strike.
@@ -101,7 +105,7 @@ def scan(strike: RepeatableStrike, unit: float, damping: float) -> tuple[float, 
     for normalised in SCANNED:
         stiffness = normalised * unit
         measures = strike.on(stiffness, damping)
-        if stiffness < strike.softest and measures["trip"]:
+        if _is_too_soft(strike, stiffness, measures):
             continue
         if measures["chatters"]:
             break

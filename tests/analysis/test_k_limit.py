@@ -65,3 +65,9 @@ def test_a_wall_too_soft_to_hold_the_hand_is_passed_over() -> None:
     assert k_limits([thrown], 0.0)["limit"][0] > 0.28
     stiff = Known(lambda k: k < 0.01 or k > 0.3, softest=0.001, trips=lambda k: k < 0.01)
     assert k_limits([stiff], 0.0)["limit"][0] < 0.001
+
+
+def test_a_strike_that_a_wall_is_too_soft_for_is_no_chatter_at_the_worst_limit_either() -> None:
+    thrown = Known(lambda k: k < 0.01 or k > 0.3, softest=0.02, trips=lambda k: k < 0.01)
+    found = k_limits([thrown, Known(lambda k: k > 0.003)], 0.0)
+    assert found["worst"][0] == found["limit"].min() > 0.0
