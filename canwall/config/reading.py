@@ -199,9 +199,13 @@ _TOML_TYPES = {
 def first_error(error: ValidationError, model: type[BaseModel] = Settings) -> str:
     """Return one line about the first error: key, what is wrong, what to do.
 
-    If a key is missing, it tells all that are missing beside it.
+    If a key is missing, it tells all that are missing beside it; or one that is unknown, which may
+    be the one that is missing.
     """
-    first, *others = error.errors()
+    errors = error.errors()
+    if errors[0]["type"] == "missing":
+        errors.sort(key=lambda each: each["type"] != "extra_forbidden")
+    first, *others = errors
     where = [str(part) for part in first["loc"]]
     key = ".".join(where)
     given = first["input"]

@@ -158,6 +158,10 @@ REFUSED: list[tuple[dict[str, object], str]] = [
     ({"walll.law": "x"}, "walll: unknown key; did you mean wall?"),
     ({"bus.cycle": 0.001}, "bus.cycle: unknown key; did you mean cycle_s?"),
     (
+        {"drive.node_id": None, "drive.node_ids": 5},
+        "drive.node_ids: unknown key; did you mean node_id?",
+    ),
+    (
         {"wall.stifness_nm_per_rad": 5},
         "wall.stifness_nm_per_rad: unknown key; did you mean stiffness_nm_per_rad?",
     ),
