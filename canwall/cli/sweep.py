@@ -12,7 +12,6 @@ from canwall.cli.options import ConfigArgument, JsonOption, LawsOption, settings
 from canwall.cli.output import ProgressDisplay, console, print_json, print_text, say
 from canwall.errors import InputError, RunFailedError
 from canwall.extras import need
-from canwall.stopping import stop_on_signals
 
 if TYPE_CHECKING:
     from xarray import Dataset
@@ -104,7 +103,7 @@ def sweep(
     from canwall.sweep import ineffective_axis_notes, make_plan, sweep_table
     from canwall.sweep import sweep as run_sweep
 
-    with stop_on_signals(held=False), ProgressDisplay() as display:
+    with ProgressDisplay() as display:
         plan = make_plan(settings, axes, through)
         progress = partial(display.count, "sweeping")
         try:
@@ -155,7 +154,7 @@ def _compute_law_table(
 
     if output is not None and os.path.lexists(output):
         raise InputError(f"{output}: exists already; choose another --output")
-    with stop_on_signals(held=False), ProgressDisplay() as display:
+    with ProgressDisplay() as display:
         progress = partial(display.count, "striking walls")
         operators = operators or list(OPERATORS)
         dataset = compute_law_table(

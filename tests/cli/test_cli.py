@@ -3,7 +3,6 @@
 import contextlib
 import importlib
 import os
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -279,19 +278,6 @@ def test_exit_codes(
     monkeypatch.setattr(importlib.import_module("canwall.run"), "run_together", fail)
     said = say("run")
     assert (said.code, said.err) == (code, err)
-
-
-def test_sigterm_ends_a_sweep_as_ctrl_c_does(say: Say, monkeypatch: pytest.MonkeyPatch) -> None:
-    def end(*args: object, **kwargs: object) -> None:
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    monkeypatch.setattr(importlib.import_module("canwall.sweep"), "sweep", end)
-    previous = signal.signal(signal.SIGTERM, lambda *args: None)
-    try:
-        said = say("sweep", "--output", "a.nc", "--stiffness", "10")
-    finally:
-        signal.signal(signal.SIGTERM, previous)
-    assert (said.code, said.err) == (130, "canwall: interrupted; --resume continues a.nc\n")
 
 
 @pytest.mark.parametrize("error", [RunFailedError("gone"), InputError("gone")])
