@@ -330,12 +330,14 @@ def _shaft(settings: Settings) -> ElasticShaft | None:
     if not mechanics.shaft_hz:
         return None
     assert mechanics.rotor_inertia_kg_m2 is not None
+    # A model that is told a hand has its damping, which is beyond the shaft.
+    viscous = mechanics.viscous_nm_s_per_rad if settings.operator.adapt else 0.0
     return ElasticShaft(
         mechanics.inertia_kg_m2,
         mechanics.rotor_inertia_kg_m2,
         mechanics.shaft_hz,
         mechanics.shaft_damping_ratio,
-        mechanics.viscous_nm_s_per_rad,
+        viscous,
     )
 
 

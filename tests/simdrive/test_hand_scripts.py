@@ -126,7 +126,7 @@ def test_scripts_are_read_and_written(tmp_path: Path) -> None:
         ),
         (
             {"script": [{"move": "rest", "duration": 1.0}]},
-            "simulation.hand.script.0.duration_s: is missing; add it",
+            "simulation.hand.script.0.duration: unknown key; did you mean duration_s?",
         ),
         (
             {"random": {"pause_s": [0.3, 0.2]}},
