@@ -140,7 +140,7 @@ BANK = np.dtype(
 )
 
 #: Share of its gain within which the estimator has nearly settled: meanwhile nothing is identified.
-_SETTLED = 0.01
+_NEARLY_SETTLED = 0.01
 #: Time without torque after which another hand may be at the handle [s].
 _FORGOTTEN_S = 0.2
 #: Share of the way to the likeliest mass that is gone in a period.
@@ -257,7 +257,7 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
     n = bank.count
     state, gain = bank.state, bank.gain
     bank.regression[0].delay = estimator.told
-    if not estimator.settled and not settle_within(estimator, _SETTLED):
+    if not estimator.settled and not settle_within(estimator, _NEARLY_SETTLED):
         follow_estimator(bank, estimator)
         bank.equal = bank.alone = bank.pressed = 0
         bank.flies = bank.presses = False

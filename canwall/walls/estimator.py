@@ -277,30 +277,6 @@ def note_missing_sample(estimator: Record) -> None:
 
 
 @compiled
-def _correct_covariance(estimator: Record) -> None:
-    """Set the gain of a sample, L = P·cᵀ/(c·P·cᵀ + R), and the covariance P − L·c·P after it."""
-    p, scale = estimator.covariance, estimator.scale
-    yy, yv, yd = p[0, 0], p[0, 1], p[0, 2]
-    variance = yy + _QUANTISATION
-    settled = estimator.gap == 0
-    for i, covariance in enumerate((yy, yv, yd)):
-        estimator.gain[i] = covariance / variance * (scale[i] / scale[0])
-        steady = estimator.steady_gain[i]
-        settled = settled and abs(estimator.gain[i] - steady) <= _SETTLED * abs(steady)
-    if settled:
-        estimator.settled = True
-        estimator.gain[:] = estimator.steady_gain
-        return
-    # In the first row (1 − L)·P = R/(c·P·cᵀ + R)·P, without a difference that loses digits.
-    left = _QUANTISATION / variance
-    p[0, 0], p[0, 1], p[0, 2] = left * yy, left * yv, left * yd
-    p[1, 1] -= yv * yv / variance
-    p[1, 2] -= yv * yd / variance
-    p[2, 2] -= yd * yd / variance
-    p[1, 0], p[2, 0], p[2, 1] = p[0, 1], p[0, 2], p[1, 2]
-
-
-@compiled
 def settle_within(estimator: Record, share: float) -> bool:
     """Return to the steady state if the gain is within a share of its own; True if it is there."""
     for i in range(3):
@@ -310,6 +286,25 @@ def settle_within(estimator: Record, share: float) -> bool:
     estimator.settled = True
     estimator.gain[:] = estimator.steady_gain
     return True
+
+
+@compiled
+def _correct_covariance(estimator: Record) -> None:
+    """Set the gain of a sample, L = P·cᵀ/(c·P·cᵀ + R), and the covariance P − L·c·P after it."""
+    p, scale = estimator.covariance, estimator.scale
+    yy, yv, yd = p[0, 0], p[0, 1], p[0, 2]
+    variance = yy + _QUANTISATION
+    for i, covariance in enumerate((yy, yv, yd)):
+        estimator.gain[i] = covariance / variance * (scale[i] / scale[0])
+    if estimator.gap == 0 and settle_within(estimator, _SETTLED):
+        return
+    # In the first row (1 − L)·P = R/(c·P·cᵀ + R)·P, without a difference that loses digits.
+    left = _QUANTISATION / variance
+    p[0, 0], p[0, 1], p[0, 2] = left * yy, left * yv, left * yd
+    p[1, 1] -= yv * yv / variance
+    p[1, 2] -= yv * yd / variance
+    p[2, 2] -= yd * yd / variance
+    p[1, 0], p[2, 0], p[2, 1] = p[0, 1], p[0, 2], p[1, 2]
 
 
 @compiled
