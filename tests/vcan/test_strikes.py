@@ -4,7 +4,7 @@ from collections import Counter
 
 import numpy as np
 from commands import Record, read_log
-from conftest import Strikes
+from conftest import MAIN_JOB_S, Strikes
 from other_nodes import EMCY, HEARTBEAT, TPDO, chatter
 from rig import RPDO1, SDO_ANSWER, SDO_REQUEST, SYNC, TPDO1
 from socketcan import first_difference
@@ -16,7 +16,7 @@ def test_signals_are_those_of_the_embedded_bus(
     """Bit by bit on the bus; what is computed beside, but for rounding on another processor."""
     ours, theirs = strikes.record.signals, embedded.signals
     assert strikes.record.summary["timing"]["exchange"] == exchange
-    assert ours.num_rows > 4200
+    assert ours.num_rows > 1000 * MAIN_JOB_S
     assert first_difference(strikes.record.cycles, embedded.cycles) is None
     assert ours.schema.equals(theirs.schema)
     for name in set(ours.column_names) - {"sync_interval_s", "latency_s"}:
@@ -29,8 +29,8 @@ def test_signals_are_those_of_the_embedded_bus(
 
 def test_standard_chatters_and_mean_force_does_not(strikes: Strikes) -> None:
     found = strikes.record.summary["strikes"]
-    assert [strike["law"] for strike in found] == ["mean_force", "standard"] * 2
-    assert [strike["chatter"] for strike in found] == [False, True, False, True]
+    assert [strike["law"] for strike in found] == ["mean_force", "standard"]
+    assert [strike["chatter"] for strike in found] == [False, True]
 
 
 def test_candump_has_the_record_frame_by_frame(strikes: Strikes) -> None:
