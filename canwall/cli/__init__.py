@@ -4,7 +4,12 @@ There is a module for each group of commands; `options`, `output`, `ending` and 
 they share.
 """
 
+import os
 from typing import NoReturn
+
+# Read when numpy is loaded. For matrices as small as these threads of BLAS gain nothing, and they
+# spin on the processors that the loop, its writer and the drive need.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from canwall.cli import beginning, bench, export, identify, panel, run, study, sweep, workbench
 from canwall.cli.ending import INTERRUPTED, guarded

@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import shlex
 import subprocess
 import sys
@@ -66,6 +67,21 @@ def test_as_a_module() -> None:
     words = [sys.executable, "-m", "canwall", "--version"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert (done.returncode, done.stdout) == (0, f"canwall {version('canwall')}\n")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("given", "threads"), [({}, 1), ({"OMP_NUM_THREADS": "2"}, 2)])
+def test_blas_has_one_thread_unless_another_number_is_asked_for(
+    given: dict[str, str], threads: int
+) -> None:
+    program = (
+        "import canwall.cli, canwall.identify\nfrom threadpoolctl import threadpool_info\n"
+        "print({p['num_threads'] for p in threadpool_info() if p['user_api'] == 'blas'})"
+    )
+    others = {name: value for name, value in os.environ.items() if not name.endswith("_THREADS")}
+    words, environment = [sys.executable, "-c", program], others | given
+    done = subprocess.run(words, capture_output=True, text=True, env=environment, check=True)
+    assert done.stdout == f"{{{min(threads, len(os.sched_getaffinity(0)))}}}\n"
 
 
 # Completion
