@@ -245,6 +245,8 @@ def _kind_of(drive: str, eds: Path | None) -> tuple[str, dict[str, Any]]:
     from canwall import config
     from canwall.bench import KEYS_OF_A_KIND
 
+    if eds is not None and not eds.is_file():
+        raise InputError(f"--eds {eds}: no such EDS or DCF")
     if drive in config.catalogue():
         path = config.catalogue()[drive]
         kind = config.load(path).drive

@@ -136,6 +136,7 @@ BUS = ("--interface", "virtual", "--channel", "nobody")
         (["init", *BUS], "--drive is missing: drive (a name of `canwall config`, or the path"),
         (["init", "--drive", "epos4", *BUS], "--drive epos4: its file maxon_epos4_0x1018.eds is "),
         (["init", "--drive", "epos5", *BUS], "--drive epos5: neither an EDS nor one of ideal, "),
+        (["init", "--drive", "sim", "--eds", "none.eds", *BUS], "--eds none.eds: no such EDS or"),
         (["init", "--drive", "sim", *BUS], "no node answers: are drive and bus on, and at this "),
         (["config", "epos5"], "epos5: no configuration of this name; did you mean epos4?"),
         (["config", "--output", "x.toml"], "--output needs the NAME of a configuration; `canwall"),
