@@ -31,6 +31,8 @@ _SAME = 0.02
 _LEAST_STEPS, _MOST_RATED = 10.0, 20.0
 
 _GIVE_COUNTS = "give drive.counts_per_rev (increments per turn of the motor)"
+_GIVE_GEAR = "give drive.gear_ratio (turns of the motor per turn of the shaft)"
+_GIVE_RATED = "give drive.rated_torque_nm"
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,7 @@ def _gear_ratio(node: DriveNode, settings: DriveSettings) -> tuple[float, str]:
     if settings.gear_ratio is not None:
         return settings.gear_ratio, "drive.gear_ratio"
     if node.has(od.GEAR_RATIO, 1):
-        return _quotient(node, od.GEAR_RATIO), "0x6091"
+        return _quotient(node, od.GEAR_RATIO, _GIVE_GEAR), "0x6091"
     return 1.0, "no 0x6091: assumed to have no gear"
 
 
@@ -127,12 +129,12 @@ def _counts_per_rev(node: DriveNode, settings: DriveSettings, gear: float) -> tu
             )
     # A quotient of one is the default of a drive whose encoder or feed was never set.
     if node.has(od.FEED_CONSTANT, 1):
-        feed = _quotient(node, od.FEED_CONSTANT)
+        feed = _quotient(node, od.FEED_CONSTANT, _GIVE_COUNTS)
         if feed != 1.0:
             return feed, "0x6092: units per turn of the shaft"
     if not node.has(od.POSITION_ENCODER_RESOLUTION, 1):
         raise DriveError(f"the drive has no 0x608F: {_GIVE_COUNTS}")
-    counts = _quotient(node, od.POSITION_ENCODER_RESOLUTION)
+    counts = _quotient(node, od.POSITION_ENCODER_RESOLUTION, _GIVE_COUNTS)
     if counts == 1.0:
         raise DriveError(f"node {node.node_id}, 0x608F: 1/1 is not an encoder; {_GIVE_COUNTS}")
     return counts * gear, "0x608F" + (" and the gear" if gear != 1.0 else "")
@@ -145,8 +147,10 @@ def _rated_torque(
     if settings.rated_torque_nm is not None:
         return settings.rated_torque_nm, "drive.rated_torque_nm"
     if not node.has(od.MOTOR_RATED_TORQUE):
-        raise DriveError("the drive has no 0x6076: give drive.rated_torque_nm")
+        raise DriveError(f"the drive has no 0x6076: {_GIVE_RATED}")
     value = node.read(od.MOTOR_RATED_TORQUE)
+    if value == 0:
+        raise DriveError(f"node {node.node_id}, 0x6076 = 0: {_GIVE_RATED}")
     if settings.rated_torque_unit_nm is not None:
         unit = settings.rated_torque_unit_nm
         return value * unit, f"0x6076 = {value}, in drive.rated_torque_unit_nm = {unit:g}"
@@ -155,7 +159,7 @@ def _rated_torque(
         if maxon and math.isclose(value * unit, maxon, rel_tol=_SAME):
             return value * unit, f"0x6076 = {value}, in {name} by 0x3001:01 and 0x3001:05"
     rated = value / 1000.0
-    if rated and not _LEAST_STEPS * rated / 1000.0 <= torque_nm <= _MOST_RATED * rated:
+    if not _LEAST_STEPS * rated / 1000.0 <= torque_nm <= _MOST_RATED * rated:
         raise DriveError(
             f"node {node.node_id}, 0x6076 = {value}: in mN·m, one per mille of it would be "
             f"{rated / 1000.0:g} N·m, which does not suit limits.torque_nm (at the motor "
@@ -205,10 +209,10 @@ def _check_polarity(node: DriveNode) -> None:
         )
 
 
-def _quotient(node: DriveNode, index: int) -> float:
+def _quotient(node: DriveNode, index: int, do: str) -> float:
     numerator, denominator = node.read(index, 1), node.read(index, 2)
     if numerator <= 0 or denominator <= 0:
         raise DriveError(
-            f"node {node.node_id}, 0x{index:04X}: {numerator}/{denominator} is not a scale"
+            f"node {node.node_id}, 0x{index:04X}: {numerator}/{denominator} is not a scale; {do}"
         )
     return numerator / denominator

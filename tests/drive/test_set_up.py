@@ -180,15 +180,21 @@ def test_no_gear_ratio_is_a_ratio_of_one(rig: Rig) -> None:
     assert rig.set_up().units.counts_per_rev == pytest.approx(131072)
 
 
-@pytest.mark.parametrize("lie", [{(0x608F, 1): 0}, {(0x6091, 2): 0}])
-def test_scale_of_zero(rig: Rig, lie: dict[Object, int]) -> None:
-    rig.tampering.lies |= lie
-    assert "is not a scale" in error_of(rig)
+@pytest.mark.parametrize(
+    ("zero", "words"),
+    [
+        ((0x608F, 1), "0x608F: 0/1 is not a scale; give drive.counts_per_rev"),
+        ((0x6091, 2), "0x6091: 1/0 is not a scale; give drive.gear_ratio"),
+    ],
+)
+def test_scale_of_zero(rig: Rig, zero: Object, words: str) -> None:
+    rig.tampering.lies[zero] = 0
+    assert words in error_of(rig)
 
 
 def test_rated_torque_of_zero(rig: Rig) -> None:
     rig.tampering.lies[(0x6076, 0)] = 0
-    assert "rated_torque_nm has to be positive" in error_of(rig)
+    assert "0x6076 = 0: give drive.rated_torque_nm" in error_of(rig)
 
 
 # Drives that misbehave
