@@ -66,7 +66,10 @@ def select_mode(node: DriveNode, wanted: str) -> Mode:
             reasons.append(str(error))
             continue
         return Mode(mode, "; ".join([_evidence(supported, mode, listed, wanted), *reasons]))
-    raise DriveError(f"{'; '.join(reasons)}: no torque mode, so this drive cannot render a wall")
+    why = "; ".join(reasons)
+    if wanted != "auto":
+        raise DriveError(f'{why}: drive.mode = "{wanted}" wants no other mode; try "auto"')
+    raise DriveError(f"{why}: no torque mode, so this drive cannot render a wall")
 
 
 def _evidence(supported: int | None, mode: int, listed: list[int], wanted: str) -> str:

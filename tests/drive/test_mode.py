@@ -75,7 +75,7 @@ def test_no_torque_mode_at_all(make_rig: RigFactory) -> None:
 def test_profile_torque_needs_a_slope(make_rig: RigFactory) -> None:
     rig = rig_with(make_rig, "pt", supported=0x65)
     del rig.node.dictionary[0x6087]
-    with pytest.raises(DriveError, match="profile torque needs 0x6087"):
+    with pytest.raises(DriveError, match=r'needs 0x6087.*drive\.mode = "pt".*try "auto"'):
         rig.set_up()
 
 
