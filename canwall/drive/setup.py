@@ -217,7 +217,10 @@ def _write_parameters(node: DriveNode, settings: DriveSettings) -> None:
     if settings.download_dcf:
         _download_dcf(node)
     for (index, subindex), value in settings.parameters_by_index.items():
-        node.set(index, subindex, value)
+        try:
+            node.set(index, subindex, value)
+        except DriveError as error:
+            raise DriveError(f"drive.parameters: {error}") from None
 
 
 def _download_dcf(node: DriveNode) -> None:

@@ -62,5 +62,5 @@ def test_parameter_that_names_no_object(name: str) -> None:
 
 def test_parameter_that_has_no_room(make_rig: RigFactory) -> None:
     rig = make_rig(settings_with({"drive.parameters": {"0x6072": 70000}}))
-    with pytest.raises(Exception, match="0x6072:00: 0x11170 does not fit into it"):
+    with pytest.raises(Exception, match=r"drive\.parameters: 0x6072:00: 0x11170 does not fit"):
         rig.set_up()
