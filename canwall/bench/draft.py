@@ -70,8 +70,7 @@ def read_drive(link: Link, drive: DriveSettings) -> DriveFacts:
     identity = identify(node)
     node.refuse_twin()
     # No torque is asked for yet: the rated torque is believed, and is there to be compared.
-    rated = node.read(od.MOTOR_RATED_TORQUE) * 1e-3 if node.has(od.MOTOR_RATED_TORQUE) else 0.0
-    scales = read_scales(node, drive, identity, rated)
+    scales = read_scales(node, drive, identity, None)
     position = node.read(od.POSITION_ACTUAL_VALUE) * scales.units.rad_per_count
     return DriveFacts(identity, scales, position)
 

@@ -51,7 +51,7 @@ class Scales:
 
 
 def read_scales(
-    node: DriveNode, settings: DriveSettings, identity: Identity, torque_nm: float
+    node: DriveNode, settings: DriveSettings, identity: Identity, torque_nm: float | None
 ) -> Scales:
     """Read the scales from 0x608F, 0x6091, 0x6092, 0x60A8 and 0x6076, unless `[drive]` has them.
 
@@ -59,7 +59,8 @@ def read_scales(
         node: The drive.
         settings: `[drive]`.
         identity: Identity of the drive.
-        torque_nm: `limits.torque_nm`; a rated torque that does not suit it is not believed.
+        torque_nm: `limits.torque_nm`; a rated torque that does not suit it is not believed. None:
+            any is.
 
     Raises:
         DriveError: If a scale cannot be read or believed; names the key to give for each.
@@ -75,7 +76,8 @@ def read_scales(
 
     gear, gear_source = found(lambda: _gear_ratio(node, settings))
     counts, counts_source = found(lambda: _counts_per_rev(node, settings, gear))
-    rated, rated_source = found(lambda: _rated_torque(node, settings, identity, torque_nm / gear))
+    at_motor_nm = None if torque_nm is None else torque_nm / gear
+    rated, rated_source = found(lambda: _rated_torque(node, settings, identity, at_motor_nm))
     per_mille, limit_source = found(lambda: _torque_limit(node))
     try:
         _check_polarity(node)
@@ -141,7 +143,7 @@ def _counts_per_rev(node: DriveNode, settings: DriveSettings, gear: float) -> tu
 
 
 def _rated_torque(
-    node: DriveNode, settings: DriveSettings, identity: Identity, torque_nm: float
+    node: DriveNode, settings: DriveSettings, identity: Identity, torque_nm: float | None
 ) -> tuple[float, str]:
     """Return the rated torque of the motor and its source; torque_nm: limit at the motor."""
     if settings.rated_torque_nm is not None:
@@ -159,7 +161,8 @@ def _rated_torque(
         if maxon and math.isclose(value * unit, maxon, rel_tol=_SAME):
             return value * unit, f"0x6076 = {value}, in {name} by 0x3001:01 and 0x3001:05"
     rated = value / 1000.0
-    if not _LEAST_STEPS * rated / 1000.0 <= torque_nm <= _MOST_RATED * rated:
+    suits = torque_nm is None or _LEAST_STEPS * rated / 1000.0 <= torque_nm <= _MOST_RATED * rated
+    if not suits:
         raise DriveError(
             f"node {node.node_id}, 0x6076 = {value}: in mN·m, one per mille of it would be "
             f"{rated / 1000.0:g} N·m, which does not suit limits.torque_nm (at the motor "

@@ -4,9 +4,10 @@ import dataclasses
 import tomllib
 from pathlib import Path
 
+import pytest
 from rig import RigFactory, settings_with
 
-from canwall.bench.draft import DriveFacts, draft
+from canwall.bench.draft import DriveFacts, draft, read_drive
 
 
 def test_negative_parameters(make_rig: RigFactory, tmp_path: Path) -> None:
@@ -31,3 +32,10 @@ def test_no_more_torque_than_the_drive_gives(make_rig: RigFactory, tmp_path: Pat
     text = draft(settings.bus, settings.drive, facts, "A drive", 1e-4, tmp_path / "first.toml")
     assert tomllib.loads(text)["limits"]["torque_nm"] == 0.025
     assert "# all that the drive gives" in text
+
+
+def test_gear_of_any_ratio(make_rig: RigFactory) -> None:
+    """There is no limit of the torque yet that the rated torque would have to suit."""
+    rig = make_rig()
+    drive = rig.settings.drive.model_copy(update={"gear_ratio": 160.0})
+    assert read_drive(rig.link, drive).rated_torque_nm == pytest.approx(160.0 * 0.637)
