@@ -1,10 +1,12 @@
 """Draft of a configuration from what a drive tells: soft, with every assumption in a comment."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import tomli_w
+from canopen.objectdictionary import ObjectDictionary
 
 from canwall.analysis.felt import HANDLE_RADIUS_M
 from canwall.bench.soft_wall import (
@@ -19,7 +21,7 @@ from canwall.config import Drive as DriveSettings
 from canwall.drive import REQUIRED_OBJECTS, DriveNode, Link
 from canwall.drive import objects as od
 from canwall.drive.identity import Identity, identify
-from canwall.drive.scales import Scales, read_scales
+from canwall.drive.scales import Scales, angles_per_rev, read_scales
 from canwall.eds import load_eds
 
 #: Keys of `[drive]` that are the same for all drives of a kind.
@@ -65,14 +67,34 @@ def read_drive(link: Link, drive: DriveSettings) -> DriveFacts:
         DriveError: If it does not answer, is no drive, or does not tell a scale.
     """
     dictionary = load_eds(drive.eds, drive.node_id, REQUIRED_OBJECTS)
-    node = DriveNode(link, drive.node_id, dictionary, drive.sdo_timeout_s)
+    node = _PlannedDrive(link, drive, dictionary)
     node.wait_until_present(drive.wait_s)
     identity = identify(node)
     node.refuse_twin()
     # No torque is asked for yet: the rated torque is believed, and is there to be compared.
     scales = read_scales(node, drive, identity, None)
-    position = node.read(od.POSITION_ACTUAL_VALUE) * scales.units.rad_per_count
+    position = node.read(od.POSITION_ACTUAL_VALUE) * node.rad_per_count(scales)
     return DriveFacts(identity, scales, position)
+
+
+class _PlannedDrive(DriveNode):
+    """A drive whose objects read as they will once `[drive] parameters` are written."""
+
+    def __init__(self, link: Link, drive: DriveSettings, dictionary: ObjectDictionary) -> None:
+        super().__init__(link, drive.node_id, dictionary, drive.sdo_timeout_s)
+        self._parameters = drive.parameters_by_index
+
+    def read(self, index: int, subindex: int = 0) -> int:
+        present = super().read(index, subindex)
+        return self._parameters.get((index, subindex), present)
+
+    def rad_per_count(self, scales: Scales) -> float:
+        """Return the size of a count at present, which the parameters may change."""
+        if (od.SI_UNIT_POSITION, 0) in self._parameters and self.has(od.SI_UNIT_POSITION):
+            angles = angles_per_rev(super().read(od.SI_UNIT_POSITION))
+            if angles is not None:
+                return 2.0 * math.pi / angles[0]
+        return scales.units.rad_per_count
 
 
 def draft(

@@ -118,13 +118,10 @@ def _counts_per_rev(node: DriveNode, settings: DriveSettings, gear: float) -> tu
         return settings.counts_per_rev * gear, "drive.counts_per_rev"
     if node.has(od.SI_UNIT_POSITION):
         unit = node.read(od.SI_UNIT_POSITION)
-        code, exponent = unit >> 16 & 0xFF, int.from_bytes([unit >> 24 & 0xFF], signed=True)
-        if code in _ANGLES:
-            return (
-                _ANGLES[code] / 10.0**exponent,
-                f"0x60A8 = {unit:#010x}: {10.0**exponent:g} {_ANGLE_NAMES[code]}",
-            )
-        if code not in _INCREMENTS:
+        angles = angles_per_rev(unit)
+        if angles is not None:
+            return angles
+        if unit >> 16 & 0xFF not in _INCREMENTS:
             raise DriveError(
                 f"node {node.node_id}, 0x60A8 = {unit:#010x}: neither increments nor an angle; "
                 f"{_GIVE_COUNTS}"
@@ -140,6 +137,15 @@ def _counts_per_rev(node: DriveNode, settings: DriveSettings, gear: float) -> tu
     if counts == 1.0:
         raise DriveError(f"node {node.node_id}, 0x608F: 1/1 is not an encoder; {_GIVE_COUNTS}")
     return counts * gear, "0x608F" + (" and the gear" if gear != 1.0 else "")
+
+
+def angles_per_rev(unit: int) -> tuple[float, str] | None:
+    """Return the units per turn and their name if 0x60A8 is a unit of angle, otherwise None."""
+    code, exponent = unit >> 16 & 0xFF, int.from_bytes([unit >> 24 & 0xFF], signed=True)
+    if code not in _ANGLES:
+        return None
+    name = f"0x60A8 = {unit:#010x}: {10.0**exponent:g} {_ANGLE_NAMES[code]}"
+    return _ANGLES[code] / 10.0**exponent, name
 
 
 def _rated_torque(

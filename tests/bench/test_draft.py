@@ -3,11 +3,16 @@
 import dataclasses
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rig import RigFactory, settings_with
 
+from canwall import config
 from canwall.bench.draft import DriveFacts, draft, read_drive
+from canwall.config import Settings, with_overrides
+
+VENDORS = Path(__file__).parents[3] / "shared" / "vendor-eds"
 
 
 def test_negative_parameters(make_rig: RigFactory, tmp_path: Path) -> None:
@@ -39,3 +44,30 @@ def test_gear_of_any_ratio(make_rig: RigFactory) -> None:
     rig = make_rig()
     drive = rig.settings.drive.model_copy(update={"gear_ratio": 160.0})
     assert read_drive(rig.link, drive).rated_torque_nm == pytest.approx(160.0 * 0.637)
+
+
+def vendor_settings(name: str, changes: dict[str, Any]) -> Settings:
+    path = config.catalogue()[name]
+    eds = VENDORS / config.load(path).drive.eds.name
+    if not eds.is_file():
+        pytest.skip(f"{VENDORS} has no {eds.name}")
+    handle = {"simulation.hand.rest_rad": 2.0}
+    return with_overrides(config.load(path, {"drive.eds": eds}), handle | changes)
+
+
+@pytest.mark.parametrize("counts", [None, 131072.0])
+def test_position_in_the_unit_that_the_drive_still_has(
+    make_rig: RigFactory, counts: float | None
+) -> None:
+    """C5-E: 0x6064 in tenths of a degree, and in increments once its parameters are written."""
+    rig = make_rig(vendor_settings("nanotec", {"drive.counts_per_rev": counts}))
+    facts = read_drive(rig.link, rig.settings.drive)
+    assert facts.position_rad == pytest.approx(2.0, abs=2e-3)
+    assert facts.scales.units.counts_per_rev == 131072.0
+
+
+def test_torque_limit_as_the_parameters_have_it(make_rig: RigFactory) -> None:
+    """EVE-NET: 0x6073 is 40 per mille until its parameters are written."""
+    rig = make_rig(vendor_settings("ingenia", {}))
+    facts = read_drive(rig.link, rig.settings.drive)
+    assert facts.scales.torque_limit_nm == pytest.approx(3.0)
