@@ -6,7 +6,7 @@ Nothing but the first motion gives a torque.
 import re
 import time
 from collections.abc import Callable
-from contextlib import closing, suppress
+from contextlib import closing
 
 import can
 
@@ -199,7 +199,8 @@ class Trial:
         node = self._node
         if "the master had stood still" in trip:
             return "set the machine up for real time, or lengthen drive.watchdog_s"
-        with suppress(DriveError, can.CanError):
+        no_tpdo = "no TPDO" in trip
+        try:
             if node.has(od.DIGITAL_INPUTS) and node.read(od.DIGITAL_INPUTS) & _INTERLOCK:
                 return (
                     "0x60FD bit 3, interlock: release safe torque off or the emergency stop, and "
@@ -214,7 +215,7 @@ class Trial:
                     return do
             if reported:
                 return "the drive's manual has its error codes"
-            if trip.startswith("no TPDO"):
+            if no_tpdo:
                 return (
                     "look whether SYNC reaches it (0x1005), and what holds back its TPDO (0x1800)"
                 )
@@ -227,6 +228,11 @@ class Trial:
                     f"it follows 0x6040 by SDO, not by its RPDO ({self._setup.rpdo.cob_id:#05x}): "
                     f"look for what keeps the RPDO from it, or who else sends it"
                 )
+        except DriveError:
+            if no_tpdo:
+                return "it answers no request either: look to its cable and to its supply"
+        except can.CanError:
+            pass
         return ""
 
     def _error_code(self) -> int:
