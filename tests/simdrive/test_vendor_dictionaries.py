@@ -134,6 +134,19 @@ def test_units(vendor: Vendor, of_vendor: ConfiguredBench, monkeypatch: pytest.M
         assert bench.read(0x6076) == 1250
 
 
+@pytest.mark.parametrize(
+    ("index", "value", "size", "factor"),
+    [(0x60A8, 0x00B50000, 4, 4000 / 3600), (0x607E, 0x80, 1, -1.0)],
+)
+def test_position_follows_its_unit_before_a_sync(
+    index: int, value: int, size: int, factor: float
+) -> None:
+    bench = ConfiguredBench(path_of("nanotec_C5-E-2-09.eds"))
+    before = bench.read(0x6064, signed=True)
+    bench.write(index, 0, value, size)
+    assert bench.read(0x6064, signed=True) == pytest.approx(factor * before, abs=0.6)
+
+
 @pytest.mark.parametrize("number", [1, 2, 3, 4])
 def test_four_pdos_each_way_in_the_order_of_cia_301(
     of_vendor: ConfiguredBench, number: int

@@ -80,8 +80,8 @@ class Feedback:
         self._polarity = dictionary.number(0x607E, absent=0)
         self._unit = dictionary.number(0x60A9, absent=0)
         self._unit.check = self._check_unit
-        self._position_unit = PositionUnit(dictionary, state)
-        self._polarity.react = self._unit.react = lambda _: self._settle()
+        self._position_unit = PositionUnit(dictionary, state, self._latch_again)
+        self._polarity.react = self._unit.react = self._react
         self._state.position_shift = self._state.counts = 0
         self.rad_s_per_unit = 0.0
         """One unit of velocity at the shaft, in rad/s; accelerations are in this per second."""
@@ -115,6 +115,14 @@ class Feedback:
     def sample(self) -> None:
         """Latch position and velocity."""
         latch(self._record, self._motion.counts(), float(self._motion.speed_counts_per_s()))
+
+    def _react(self, _: int) -> None:
+        self._settle()
+        self._latch_again()
+
+    def _latch_again(self) -> None:
+        """Show the last sample in the units and directions of now."""
+        latch(self._record, self.counts, float(self._motion.speed_counts_per_s()))
 
     def _settle(self) -> None:
         """Follow polarity and units."""

@@ -5,6 +5,7 @@ feed constant is 0x6092, or follows from a unit of angle in 0x60A8.
 """
 
 import math
+from collections.abc import Callable
 
 from canwall.simdrive.communication.dictionary import Dictionary, Entry
 from canwall.simdrive.state import DriveRecord
@@ -37,8 +38,14 @@ def _pair(dictionary: Dictionary, index: int) -> tuple[Entry, Entry]:
 class PositionUnit:
     """Serves the factor group. A drive with an encoder of 1/1 shows increments."""
 
-    def __init__(self, dictionary: Dictionary, state: DriveRecord) -> None:
-        """Serve the objects of the dictionary; begin with increments."""
+    def __init__(
+        self,
+        dictionary: Dictionary,
+        state: DriveRecord,
+        changed: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Serve the objects of the dictionary; begin with increments. Writes call changed."""
+        self._changed = changed
         self._state = state.fields
         self._state.position_scale = 1.0
         self._resolution, self._gear, self._feed = (
@@ -70,6 +77,7 @@ class PositionUnit:
 
     def _react(self, _: int) -> None:
         self.refresh()
+        self._changed()
 
 
 def _ratio(pair: tuple[Entry, Entry]) -> float:
