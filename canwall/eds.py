@@ -68,7 +68,9 @@ def load_eds(path: Path, node_id: int, required: Iterable[int] = ()) -> ObjectDi
         DictionaryError: If the file is missing, not an EDS or DCF, or lacks a required object.
     """
     if not path.is_file():
-        raise DictionaryError(f"{path}: no such EDS or DCF; correct drive.eds, or give --eds")
+        raise DictionaryError(
+            f"{path}: no such EDS or DCF; correct drive.eds, or give --eds to a command that has it"
+        )
     # canopen logs a traceback for an odd entry and continues; required objects are checked below.
     logging.getLogger("canopen.objectdictionary").setLevel(logging.CRITICAL)
     try:
