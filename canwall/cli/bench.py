@@ -85,8 +85,9 @@ def dbc(
     many = [settings_from(path) for path in config_files]
     from canwall.bench.dbc import dbc_text, mapped_drive
     from canwall.drive import REQUIRED_OBJECTS
-    from canwall.run import on_the_bus
+    from canwall.run import check_together, on_the_bus
 
+    check_together(many)
     with stop_on_signals(held=False), on_the_bus(*many) as link:
         drives = [mapped_drive(link, settings, REQUIRED_OBJECTS) for settings in many]
     text = dbc_text(drives)

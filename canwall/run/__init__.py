@@ -16,13 +16,14 @@ from canwall.run.assembly import (
 from canwall.run.buses import make_simulated_drive, on_the_bus, open_bus
 from canwall.run.recorded import RunRecord, read_run
 from canwall.run.result import RunResult
-from canwall.run.running import run, run_together
+from canwall.run.running import check_together, run, run_together
 from canwall.stopping import StopRequest, stop_on_signals
 
 __all__ = [
     "RunRecord",
     "RunResult",
     "StopRequest",
+    "check_together",
     "drive_dictionary",
     "make_axis",
     "make_exchange",

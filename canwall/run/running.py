@@ -88,7 +88,7 @@ def run_together(
     `live` is called with the folder of the run, or that of the drives' folders, once other
     processes can attach to it.
     """
-    _check_together(many)
+    check_together(many)
     target = None if stream is None else parse_target(stream)
     laws = [run_laws(settings) for settings in many]
     dictionaries = [drive_dictionary(settings) for settings in many]
@@ -196,7 +196,8 @@ def _told(outcome: Outcome, error: Exception) -> Exception:
     return told
 
 
-def _check_together(many: Sequence[Settings]) -> None:
+def check_together(many: Sequence[Settings]) -> None:
+    """Raise ConfigError unless the drives can be on one bus and one SYNC."""
     first = many[0]
     for settings in many[1:]:
         for section in ("bus", "run"):

@@ -72,6 +72,13 @@ def test_file_that_cannot_be_written(tmp_path: Path) -> None:
     assert done.stderr.endswith("none/bus.dbc: cannot be written: No such file or directory\n")
 
 
+@pytest.mark.slow
+def test_drives_that_cannot_be_on_one_bus(tmp_path: Path) -> None:
+    done = command("dbc", SIM_CONFIG, SIM_CONFIG, "--output", tmp_path / "bus.dbc")
+    assert done.returncode == 2
+    assert done.stderr == "canwall: drive.node_id: [5, 5]: every drive needs one of its own\n"
+
+
 def test_objects_of_one_name_are_told_apart(make_rig: RigFactory) -> None:
     rig = make_rig()
     setup, dictionary = rig.set_up(), rig.node.dictionary
