@@ -100,8 +100,12 @@ def stable_stiffness(
         stiffness = normalised * mass / period**2
         return spectral_radius(mass, viscous, stiffness, damping, period, delay) < 1.0
 
+    # On a heavy handle with little damping the limit is far below; rounding is below 1e-9.
+    grid = np.geomspace(1e-6, 10.0, 400)
+    if not is_stable(float(grid[0])):
+        grid = np.geomspace(1e-9, 1e-6, 400)
     low, high = 0.0, None
-    for normalised in np.geomspace(1e-6, 10.0, 400):
+    for normalised in grid:
         if not is_stable(normalised):
             high = float(normalised)
             break

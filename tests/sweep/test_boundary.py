@@ -93,6 +93,14 @@ def test_ceilings_are_those_of_the_eigenvalues(delay: int) -> None:
     assert stable_stiffness(1.0, 0.0, damping, 1.0, delay) == pytest.approx(ceiling, rel=0.01)
 
 
+@pytest.mark.parametrize("delay", [0, 1, 2])
+@pytest.mark.parametrize(("mass", "viscous"), [(1e-4, 5e-4), (1.0, 5e-4), (20.0, 1e-3)])
+def test_limit_of_a_heavy_handle(mass: float, viscous: float, delay: int) -> None:
+    limit = delayed_stiffness(viscous, 0.0, PERIOD, delay)
+    assert stable_stiffness(mass, viscous, 0.0, PERIOD, delay) == pytest.approx(limit, rel=0.01)
+    assert stable_stiffness(mass, 0.0, 0.0, PERIOD, delay) == 0.0
+
+
 @pytest.mark.parametrize("delay", [0, 1, 2, 3])
 def test_eigenvalues_are_those_of_the_loop(delay: int) -> None:
     mass, viscous, stiffness, damping, period = 1.3, 0.4, 0.02, 0.05, 0.9
