@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import can
 import numpy as np
 
-from canwall.config import ConfigError, load
+from canwall.config import ConfigError, Settings, load
 from canwall.record import ROW, Phase, RunFolder, numbers, read_signals
-from canwall.run.result import judged
+from canwall.run.result import delay_told, judged
 from canwall.units import DriveUnits
 
 if TYPE_CHECKING:
@@ -118,14 +118,14 @@ def _summary_from_rows(folder: RunFolder, signals: "pa.Table") -> dict[str, Any]
         "skipped_sync": None,
         "late_rpdo": None,
         "guard": None,
-        "error_frames": _error_frames(folder.path / settings.run.bus_log),
+        "error_frames": _error_frames(_bus_log(folder, settings)),
         "trips": [
             f"the run did not end by itself: it was cut off while {phase.name.lower()}, after "
             f"cycle {last} ({t_s:.3f} s)"
         ],
         "trip_cycle": last,
         "interrupted": False,
-        "delay_cycles": settings.estimator.delay_cycles,
+        "delay_cycles": delay_told(signals),
         "drive": {"rad_per_count": rad_per_count, "nm_per_mille": nm_per_mille},
         "timing": {
             "advice": [],
@@ -154,6 +154,13 @@ def _percentiles(signals: "pa.Table", name: str) -> dict[str, float]:
     found = np.percentile(values, percents, method="inverted_cdf")
     summary = {f"p{p:g}_us": float(v) for p, v in zip(percents, found, strict=True)}
     return summary | {"max_us": float(values.max())}
+
+
+def _bus_log(folder: RunFolder, settings: Settings) -> Path:
+    """Return the path of the bus log, which lies beside the folders of several drives."""
+    own = folder.path / settings.run.bus_log
+    is_of_several = folder.path.name == f"node{settings.drive.node_id}" and not own.exists()
+    return folder.path.parent / settings.run.bus_log if is_of_several else own
 
 
 def _error_frames(bus_log: Path) -> int | None:

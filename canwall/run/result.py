@@ -134,10 +134,7 @@ def judged(
     more = (0, metrics.event_window(settings.bus.cycle_s) if exceeded else 0)
     asked = AskedWall(*(np.pad(numbers(signals, n), more, "edge") for n in AskedWall._fields))
     wall_position = np.pad(numbers(signals, "wall_position_rad"), more, "edge")
-    # When the wall begins it has been measured, if it is to be, and nothing has been found yet.
-    begin = int(np.argmax(numbers(signals, "phase") == Phase.RENDERING))
-    told = float(numbers(signals, "delay_est")[begin])
-    referent = referent_motion(settings, asked, wall_position, told)
+    referent = referent_motion(settings, asked, wall_position, delay_told(signals))
     if referent is None:
         found = summarise(signals, settings, units, None, None)
     else:
@@ -150,6 +147,15 @@ def judged(
         y, felt = (values[: signals.num_rows] for values in referent)
         found = summarise(signals, settings, units, y, felt, thrown)
     return found | {"motion_delay_cycles": motion_delay}
+
+
+def delay_told(signals: "pa.Table") -> float:
+    """Return the delay D that the laws were told [periods].
+
+    When the wall begins it has been measured, if it is to be, and nothing has been found yet.
+    """
+    begin = int(np.argmax(numbers(signals, "phase") == Phase.RENDERING))
+    return float(numbers(signals, "delay_est")[begin])
 
 
 def _without_gaps(signals: "pa.Table") -> "pa.Table":

@@ -134,7 +134,7 @@ def test_summary_from_the_rows_is_that_of_the_run(four_strikes: Record, tmp_path
     folder = copy_of(four_strikes.folder, tmp_path / "run", *kept)
     found, first = read_run(folder).summary, four_strikes.summary
     assert found == folder.read_summary()
-    of_the_end = {"cut_off", "trips", "trip_cycle", "drive", "timing", "delay_cycles"}
+    of_the_end = {"cut_off", "trips", "trip_cycle", "drive", "timing"}
     of_the_end |= {"guard", "late_rpdo", "late_tpdo", "tpdo_lag_cycles", "skipped_sync"}
     assert {k: v for k, v in found.items() if k not in of_the_end} == {
         k: v for k, v in first.items() if k not in of_the_end

@@ -9,7 +9,7 @@ from rig import settings_with
 
 from canwall.config import ConfigError, Settings
 from canwall.record import TIMING_COLUMNS, read_signals, start_recorders
-from canwall.run import RunResult, run, run_together
+from canwall.run import RunResult, read_run, run, run_together
 
 DURATION_S = 0.6
 
@@ -102,3 +102,14 @@ def test_refused_folder_leaves_no_other(tmp_path: Path) -> None:
         run_all([settings_of(5), settings_of(6)], tmp_path)
     assert not (tmp_path / "node5" / "config.toml").exists()
     assert taken.read_text() == "of another run"
+
+
+@pytest.mark.slow
+def test_error_frames_of_a_run_that_was_cut_off_are_in_the_log_beside(tmp_path: Path) -> None:
+    noisy = {"kind": "corrupted", "amount": 0, "at_s": 0.3, "duration_syncs": 5, "can_id": 0x185}
+    many = [settings_of(5, {"simulation.fault": [noisy]}), settings_of(6)]
+    for result in run_all(many, tmp_path / "run"):
+        result.folder.summary.unlink()
+        known = result.summary["error_frames"]
+        assert known >= 5
+        assert read_run(result.folder).summary["error_frames"] == known
