@@ -28,12 +28,15 @@ def trip_text(axis: WallAxis, exchange: Exchange) -> str:
     cycle, row = axis.cycle[0], axis.row[0]
     j = int(row["j"])
     trip = Trip(int(cycle["trip"]))
+    position = float(row["position_rad"])
+    if trip is Trip.JUMP and not cycle["position_low"] <= position <= cycle["position_high"]:
+        trip = Trip.POSITION  # which says more
     match trip:
         case Trip.SPEED:
             speed = float(cycle["orientation"] * cycle["estimator"]["v"][0])
             what = f"speed {speed:.3g} rad/s beyond limits.speed_rad_s"
         case Trip.POSITION:
-            what = f"position {float(row['position_rad']):.4g} rad outside limits.position_rad"
+            what = f"position {position:.4g} rad outside limits.position_rad"
         case Trip.JUMP:
             what = (
                 f"the position jumped by {abs(float(cycle['innovation'])):.3g} rad, more than "

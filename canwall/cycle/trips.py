@@ -142,9 +142,7 @@ def compare_position(cycle: Record, change: int, missed: int) -> None:
     if not cycle.estimator[0].settled:
         jumped = jumped and not abs(change * cycle.rad_per_count) <= limit
     if jumped and cycle.started and cycle.phase != _LEAVING and cycle.trip == 0:
-        position = cycle.counts * cycle.rad_per_count
-        inside = cycle.position_low <= position <= cycle.position_high
-        cycle.trip = _JUMP if inside else _POSITION
+        cycle.trip = _JUMP
 
 
 @compiled

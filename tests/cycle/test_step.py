@@ -499,6 +499,15 @@ def test_jump_without_a_limit_of_its_own_is_what_the_speed_allows() -> None:
         assert wall.trip() == trip
 
 
+def test_jump_beyond_the_position_limits_is_a_jump() -> None:
+    """A handle that a wall throws beyond them comes there without one."""
+    wall = Wall({"limits.position_rad": [-0.3, 0.3], "limits.jump_rad": 0.03})
+    start_at(wall.cycle, 0)
+    wall.at(0)
+    wall.at(400)
+    assert wall.trip() == Trip.JUMP
+
+
 def test_no_jump_before_the_first_position_nor_while_leaving() -> None:
     wall = Wall({"limits.position_rad": [-9.0, 9.0], "limits.speed_rad_s": 1e9})
     wall.cycle["jump_limit"] = 0.01

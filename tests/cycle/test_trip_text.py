@@ -51,6 +51,14 @@ def test_trip_after_missing_tpdos_names_them(make_rig: RigFactory, trip: Trip) -
     assert encoder not in said
 
 
+def test_jump_beyond_the_position_limits_names_these(make_rig: RigFactory) -> None:
+    loop = Loop(make_rig(settings_with()))
+    loop.record["trip"] = Trip.JUMP
+    loop.axis.row["position_rad"] = 3.5
+    said = trip_text(loop.axis, loop.exchange)
+    assert said.endswith("position 3.5 rad outside limits.position_rad")
+
+
 @pytest.mark.parametrize("side", ["below", "above"])
 def test_speed_is_that_of_the_drive_s_axis(make_rig: RigFactory, side: str) -> None:
     loop = Loop(make_rig(settings_with({"wall.side": side})))

@@ -208,6 +208,18 @@ def test_a_wall_that_throws_the_handle_chatters_as_in_a_sweep(
     assert not judgement["chatter"]  # ended by something else
 
 
+@pytest.mark.slow
+def test_an_encoder_that_jumps_beyond_the_limits_is_no_handle_that_was_thrown(
+    tmp_path: Path,
+) -> None:
+    jump = {"kind": "encoder_jump", "at_s": 0.5, "amount": 100_000}
+    quiet = {"wall.law": "half_sample", "run.duration_s": 1.0, "simulation.fault": [jump]}
+    found = run(settings_with(quiet), tmp_path / "run")
+    (trip,) = found.outcome.trips
+    assert trip.endswith("outside limits.position_rad")
+    assert not found.summary["chatter"]
+
+
 def test_wall_that_fades_in_around_the_handle_is_not_struck(tmp_path: Path) -> None:
     # The hand rests in the wall, withdraws before it is whole, and strikes from the other side.
     settings = settings_with({"wall.side": "above", "run.duration_s": 1.05})
