@@ -218,13 +218,16 @@ def _make_plans(
     once = shared | ({"delay_error": [0.0]} if "delay_error" in shared else {})
     plans = []
     for settings, axes, dampings, some in (
-        (base, shared, (0.0,), [law for law in laws if law not in SAMPLED]),
+        (base, shared, None, [law for law in laws if law not in SAMPLED]),
         (unknowing, once, (0.0,), [law for law in laws if law in SAMPLED and law not in DAMPED]),
         (unknowing, once, DAMPINGS, [law for law in laws if law in DAMPED]),
     ):
         if some:
-            axes = {"law": some, "damping_normalised": dampings, **axes}
-            plans.append(make_plan(settings, axes, through))
+            given = {} if dampings is None else {"damping_normalised": dampings}
+            plan = make_plan(settings, {"law": some, **given, **axes}, through)
+            if dampings is None:  # the damping ratio stays in force
+                plan = replace(plan, damping=SweepAxis("damping_normalised", (0.0,)))
+            plans.append(plan)
     return plans
 
 

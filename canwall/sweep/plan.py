@@ -163,7 +163,8 @@ def make_plan(base: Settings, given: Mapping[str, object], through: str = "sim")
             raise InputError(f"sweep axis {key}: use {key[5:].split('_')[0]} instead")
     defaults: dict[str, Any] = {"law": (named_law(base),)}
     defaults |= {name: DEFAULTS[name] for name in STRIKES}
-    if not any(name in axes for name in DAMPING):
+    given_damping = next((axes[name] for name in DAMPING if name in axes), None)
+    if given_damping is None:
         defaults["damping"] = (base.wall.damping_nm_s_per_rad,)
     axes = {n: SweepAxis(n, tuple(v)) for n, v in defaults.items() if n not in axes} | axes
 
@@ -175,7 +176,10 @@ def make_plan(base: Settings, given: Mapping[str, object], through: str = "sim")
     stiffness, damping = pop(STIFFNESS), pop(DAMPING)
     speed, phase = axes.pop("speed"), axes.pop("phase")
     assert damping is not None
-    base = _without_what_is_swept(base, stiffness, damping)
+    ratio = axes.get("wall.damping_ratio")
+    if ratio is not None and any(ratio.values) and any(damping.values):
+        raise InputError(f"sweep axes {damping.name} and {ratio.name}: keep one of them")
+    base = _without_what_is_swept(base, stiffness, given_damping)
     law = axes.pop("law")
     plan = Plan(base, (law, *axes.values()), stiffness, damping, speed, phase, through)
     if plan.point_count > _MOST_POINTS:
@@ -185,15 +189,15 @@ def make_plan(base: Settings, given: Mapping[str, object], through: str = "sim")
 
 
 def _without_what_is_swept(
-    base: Settings, stiffness: SweepAxis | None, damping: SweepAxis
+    base: Settings, stiffness: SweepAxis | None, damping: SweepAxis | None
 ) -> Settings:
     """Return the settings without what would take the place of the swept values.
 
-    That is a damping ratio where dampings are given, and a cap where the largest stiffness is
-    searched.
+    That is a damping ratio where dampings are given, be it a single 0, and a cap where the largest
+    stiffness is searched.
     """
     update: dict[str, float] = {}
-    if any(damping.values):
+    if damping is not None:
         update["damping_ratio"] = 0.0
     if stiffness is None:
         update["cap"] = 0.0

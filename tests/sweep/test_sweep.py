@@ -226,6 +226,16 @@ def test_walls_rise_whatever_order_they_are_given_in() -> None:
     assert plan.damping.values == (0.0, 0.1)
 
 
+@pytest.mark.parametrize(
+    ("given", "ratio"), [({}, 0.5), ({"damping": "0"}, 0.0), ({"damping_normalised": 0.0}, 0.0)]
+)
+def test_a_damping_that_is_given_takes_the_place_of_the_ratio(
+    given: dict[str, object], ratio: float
+) -> None:
+    plan = make_plan(settings_with({"wall.damping_ratio": 0.5}), {**SMALL, **given})
+    assert plan.base.wall.damping_ratio == ratio
+
+
 def test_a_plan_is_another_one_with_other_contents_of_its_files(tmp_path: Path) -> None:
     law, eds = tmp_path / "law.py", tmp_path / "drive.eds"
     text = "def force(wall):\n    return -wall.stiffness * wall.y\n"
@@ -547,6 +557,7 @@ def test_a_law_that_does_not_return_is_named_with_its_point(tmp_path: Path, thro
         ({"counts": "10.5"}, "has to be a whole number"),
         ({"torque_step": "1.5e-7"}, "whole µN·m"),
         ({"stiffness": "1", "stiffness_normalised": "1"}, "keep one of them"),
+        ({"damping": "0.1", "wall.damping_ratio": "0.5"}, "and wall.damping_ratio: keep one"),
         ({"through": "bus", "sync_jitter": "1e-5"}, "sync_jitter: has to be 0 with --through bus"),
     ],
 )
