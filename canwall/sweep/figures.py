@@ -12,14 +12,19 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
 from numpy.typing import NDArray
 
 from canwall.analysis.analytic_limits import stable_stiffness
 from canwall.errors import InputError
 from canwall.figure_style import CHATTER, DPI, REFERENT, STYLE, line_style
 from canwall.sweep.axes import DAMPING, STIFFNESS, STRIKES
-from canwall.sweep.labels import LABELS, axis_name, panel_title, shared_parameters
+from canwall.sweep.labels import (
+    LABELS,
+    axis_name,
+    label_logarithmic,
+    panel_title,
+    shared_parameters,
+)
 from canwall.sweep.z_width import draw_z_width
 
 #: Panels of one figure; further ones go into further figures.
@@ -159,7 +164,7 @@ def _limit_over(axis: str) -> Draw:
         for law, style in _styles(dataset):
             one = dataset.sel(law=law)
             worst = one["worst_normalised"].values
-            best = worst * (one["limit"].max(STRIKES) / one["worst"].where(one["worst"] > 0)).values
+            best = (one["limit"].max(STRIKES) * one["period"] ** 2 / one["inertia"]).values
             axes.plot(x, worst, ms=4, mfc="none", label=law, **style)
             axes.fill_between(x, worst, best, color=style["color"], alpha=0.08, lw=0)
         linear = _linear_limit(dataset.isel(law=0), axis)
@@ -167,9 +172,7 @@ def _limit_over(axis: str) -> Draw:
             axes.plot(x, linear, "k--", lw=1.0, label="spring and damper, linear, exact")
         if dataset["worst_normalised"].max() > 0:
             axes.set_yscale("log")
-            low, high = axes.get_ylim()
-            axes.yaxis.set_major_formatter("{x:g}")
-            axes.yaxis.set_minor_formatter("{x:.2g}" if high < 10.0 * low else "")
+            label_logarithmic(axes.yaxis)
         axes.set_xlabel(LABELS.get(axis, axis))
         axes.set_ylabel("K-limit, K·T²/m [1] (band: strikes)")
 
@@ -197,16 +200,13 @@ def _limits_by_law(axes: Axes, dataset: xr.Dataset) -> None:
     for row, (law, style) in enumerate(_styles(dataset)):
         colour = style["color"]
         one = dataset.sel(law=law)
-        scale = one["worst_normalised"].item() / one["worst"].item() if one["worst"] > 0 else 0.0
-        strikes = one["limit"].values.ravel() * scale
+        strikes = (one["limit"] * one["period"] ** 2 / one["inertia"]).values.ravel()
         axes.plot(strikes, np.full(strikes.shape, row), ".", color=colour, alpha=0.5)
         axes.plot(one["worst_normalised"].item(), row, "D", color=colour)
     axes.set_yticks(range(dataset.sizes["law"]), [law for law, _ in _styles(dataset)])
     axes.invert_yaxis()
     axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter("")
+    label_logarithmic(axes.xaxis)
     axes.set_xlabel("K-limit, K·T²/m [1] (◆ worst, · each strike)")
 
 
@@ -214,6 +214,7 @@ def _label_over_stiffness(axes: Axes, dataset: xr.Dataset, name: str, label: str
     axes.set_xscale("log")
     low, high = dataset[name].values[[0, -1]]
     axes.set_xlim(low / 1.05, high * 1.05)
+    label_logarithmic(axes.xaxis)
     axes.set_xlabel(LABELS[name])
     axes.set_ylabel(label)
 

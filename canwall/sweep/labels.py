@@ -2,11 +2,15 @@
 
 import math
 import tomllib
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
 
 from canwall.sweep.axes import STRIKES
+
+if TYPE_CHECKING:
+    from matplotlib.axis import Axis
 
 #: Axis labels.
 LABELS = {
@@ -39,6 +43,19 @@ _TITLES = {
 def axis_name(dataset: xr.Dataset, names: tuple[str, ...]) -> str:
     """Return the one of these names that the dataset has as an axis."""
     return next(name for name in names if name in dataset.coords)
+
+
+def label_logarithmic(axis: "Axis") -> None:
+    """Label a logarithmic axis with some round numbers, over less than a decade as well."""
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+
+    low, high = axis.get_view_interval()
+    if high < 10.0 * low:
+        axis.set_major_locator(MaxNLocator(5, steps=(1, 2, 5, 10)))
+    else:
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 100.0 * low else (1.0,)))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())
 
 
 def panel_title(dataset: xr.Dataset, point: dict[str, int]) -> str:

@@ -11,7 +11,7 @@ from matplotlib.patches import Patch
 
 from canwall.figure_style import CHATTER_AREA, COLOURS, QUIET_AREA
 from canwall.sweep.axes import DAMPING, STIFFNESS, STRIKES
-from canwall.sweep.labels import LABELS, axis_name
+from canwall.sweep.labels import LABELS, axis_name, label_logarithmic
 from canwall.sweep.limit_lines import Limit, limit_lines
 
 _STYLES: dict[Limit, dict[str, Any]] = {
@@ -54,8 +54,8 @@ def draw_z_width(axes: Axes, dataset: xr.Dataset) -> None:
             )
         )
     axes.set_xscale("log")
-    axes.xaxis.set_major_formatter("{x:g}")
     axes.set_xlim(*dataset[stiffness].values[[0, -1]])
+    label_logarithmic(axes.xaxis)
     axes.set_ylim(*dataset[damping].values[[0, -1]])
     axes.set_xlabel(LABELS[stiffness])
     axes.set_ylabel(LABELS[damping])

@@ -1,5 +1,6 @@
 """The figures of a sweep, drawn from its file alone."""
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 import xarray as xr
 from colour_vision import assert_nothing_overlaps, assert_readable, assert_told_apart
 from commands import command
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from rig import settings_with
 
@@ -131,6 +133,34 @@ def test_k_limits_over_the_rate(tmp_path: Path, drawn: dict[str, Figure]) -> Non
     for rate, limit in linear:
         exact = stable_stiffness(2.28e-4, 0.0261, 0.0, 1.0 / rate, 1)
         assert limit == pytest.approx(exact / 2.28e-4 / rate**2, rel=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("low", "high"), [(10.0, 16.0), (0.01, 0.3)])
+def test_stiffnesses_along_an_axis_can_be_read(
+    tmp_path: Path, drawn: dict[str, Figure], low: float, high: float
+) -> None:
+    whole = swept(tmp_path / "a.nc", stiffness=[1.0, 2.0], damping=[0.0, 0.1], speed=1, phase=0)
+    write_sweep_figures(whole.assign_coords(stiffness=[low, high]), tmp_path / "a")
+    for figure in drawn.values():
+        FigureCanvasAgg(figure).draw()
+        axis = figure.axes[0].xaxis
+        ticks = [*axis.get_major_ticks(), *axis.get_minor_ticks()]
+        labels = [t.label1 for t in ticks if t.label1.get_text() and low <= t.get_loc() <= high]
+        assert len(labels) >= 3
+        boxes = sorted((label.get_window_extent() for label in labels), key=lambda box: box.x0)
+        assert all(one.x1 < other.x0 for one, other in itertools.pairwise(boxes))
+
+
+def test_each_strike_is_drawn_where_the_worst_chatters_on_every_wall(
+    tmp_path: Path, drawn: dict[str, Figure]
+) -> None:
+    limits = swept(tmp_path / "a.nc", speed=1, law=["standard"])
+    limits["worst"][:] = limits["worst_normalised"][:] = limits["limit"][..., 0] = 0.0
+    write_sweep_figures(limits, tmp_path / "a")
+    (strikes, _) = drawn["a-limits"].axes[0].get_lines()
+    best = limits["limit"].max() * limits["period"] ** 2 / limits["inertia"]
+    np.testing.assert_allclose(strikes.get_xdata(), [0.0, best.item()])
 
 
 @pytest.mark.slow
