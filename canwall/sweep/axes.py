@@ -68,6 +68,18 @@ DEFAULTS: dict[str, tuple[Value, ...]] = {
     "speed": (0.5, 1.0, 2.0),
     "phase": (0.0, 0.35, 0.7),
 }
+#: Keys of the configuration that every strike sets anew, and the axes from which it does.
+INSTEAD = {
+    "wall.law": "law",
+    "wall.stiffness_nm_per_rad": "stiffness",
+    "wall.damping_nm_s_per_rad": "damping",
+    "simulation.hand.rest_rad": "start",
+    "simulation.hand.approach_s": "speed",
+    "simulation.hand.withdraw_s": "speed",
+    "simulation.hand.press_s": "press",
+    "simulation.hand.press_rad": "press_torque",
+    "simulation.hand.press_torque_nm": "press_torque",
+}
 #: Axes of numbers that may be zero.
 _MAY_BE_ZERO = (
     *DAMPING,

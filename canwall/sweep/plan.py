@@ -19,6 +19,7 @@ from canwall.supervised import Call
 from canwall.sweep.axes import (
     DAMPING,
     DEFAULTS,
+    INSTEAD,
     STIFFNESS,
     STRIKES,
     SweepAxis,
@@ -158,9 +159,9 @@ def make_plan(base: Settings, given: Mapping[str, object], through: str = "sim")
             raise InputError(f"sweep axes {both[0]} and {both[1]}: keep one of them")
         if len(both) == 2:
             axes = {n: a for n, a in axes.items() if n not in both or n in given}
-    for key in ("wall.stiffness_nm_per_rad", "wall.damping_nm_s_per_rad", "wall.law"):
+    for key, instead in INSTEAD.items():
         if key in axes:
-            raise InputError(f"sweep axis {key}: use {key[5:].split('_')[0]} instead")
+            raise InputError(f"sweep axis {key}: use {instead} instead")
     defaults: dict[str, Any] = {"law": (named_law(base),)}
     defaults |= {name: DEFAULTS[name] for name in STRIKES}
     given_damping = next((axes[name] for name in DAMPING if name in axes), None)
