@@ -85,11 +85,10 @@ def find_law(name: str, deadbeat: bool = False) -> Law:
         name += DEADBEAT
     if name in LAWS:
         return LAWS[name]
-    if deadbeat and name.removesuffix(DEADBEAT) in LAWS:
+    bare = name.removesuffix(DEADBEAT)
+    if deadbeat and (bare in LAWS or bare in _user_laws or ":" in bare):
         able = ", ".join(n.removesuffix(DEADBEAT) for n in LAWS if n.endswith(DEADBEAT))
-        raise UnknownLawError(
-            f"law {name.removesuffix(DEADBEAT)} has no deadbeat compensation; {able} have"
-        )
+        raise UnknownLawError(f"law {bare} has no deadbeat compensation; {able} have")
     if name in _user_laws:
         return _user_laws[name]
     path, colon, function = name.rpartition(":")

@@ -51,7 +51,9 @@ def test_every_law_of_the_theory_is_there() -> None:
         assert law.name == name
 
 
-@pytest.mark.parametrize("law", [name for name in LAWS if not name.endswith(DEADBEAT)])
+@pytest.mark.parametrize(
+    "law", [*(name for name in LAWS if not name.endswith(DEADBEAT)), "mine.py:mine"]
+)
 def test_deadbeat_is_an_option_of_some_laws(law: str) -> None:
     if law + DEADBEAT in COMPENSATED:
         assert find_law(law, deadbeat=True) is LAWS[law + DEADBEAT]
