@@ -30,6 +30,7 @@ from canwall.walls import (
     likelier,
     may_lag,
     note_missing_sample,
+    other_torque_acts,
     predict,
     predict_bank,
     predict_open_loop,
@@ -331,8 +332,10 @@ def _sync_of_sample(cycle: Record) -> int:
 def _compare_lag(cycle: Record) -> None:
     """Compare the sample with both predictions, and go on with the likelier one in the end."""
     lagging, losing = cycle.lagging[0], cycle.losing[0]
-    if not is_probe_in_flight(cycle.bank[0].probe[0]):
-        # What a probe moves tells who is at the handle, whom neither model knows yet.
+    probe, estimator = cycle.bank[0].probe[0], cycle.estimator[0]
+    probed = is_probe_in_flight(probe)
+    if not probed or other_torque_acts(probe, estimator.in_flight, estimator.delay_periods):
+        # What a probe alone moves tells who is at the handle, whom neither model knows yet.
         cycle.lag_evidence += likelier(lagging, losing, cycle.oriented)
     if cycle.lag_evidence > _LAG_EVIDENCE:
         cycle.estimator[0] = lagging

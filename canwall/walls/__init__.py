@@ -56,7 +56,7 @@ from canwall.walls.interface import (
 )
 from canwall.walls.latch import LATCH, age_at, at_sync, expect_torques, reset_latch, set_latch
 from canwall.walls.layers import TENSION, set_applied_force, wall_force
-from canwall.walls.probe import is_probe_in_flight
+from canwall.walls.probe import is_probe_in_flight, other_torque_acts
 from canwall.walls.registry import LAWS, declare_law, find_law, is_declared
 from canwall.walls.shaft import ElasticShaft, WallLoop, stiffest_wall
 
@@ -99,6 +99,7 @@ __all__ = [
     "likelier",
     "may_lag",
     "note_missing_sample",
+    "other_torque_acts",
     "predict",
     "predict_bank",
     "predict_open_loop",

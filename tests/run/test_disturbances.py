@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from rig import settings_with
+from rig import SIM_CONFIG, settings_with
 
+from canwall import config
 from canwall.analysis import metrics
 from canwall.config import Settings
 from canwall.cycle import Trip
@@ -201,6 +202,22 @@ def test_an_adapting_model_tells_lost_from_late(begin: int) -> None:
     assert np.ptp(run.rows["mass_est"][begin - 10 : begin + 100]) == 0.0
     late = simulate(settings, cycles, disturbances=late_from(cycles, begin, cycles))
     assert (late.trip, late.lag) == (Trip.NONE, 1)
+
+
+@pytest.mark.parametrize("begin", [270, 400, 1210])
+def test_a_contact_that_begins_in_a_probe_tells_lost_from_late(begin: int) -> None:
+    """On the first samples of its force, in a grip on the wall of config/sim.toml."""
+    hand = {"inertia_kg_m2": 3.2e-4, "damping_nm_s_per_rad": 0.0384, "stiffness_nm_per_rad": 5.12}
+    settings = config.load(SIM_CONFIG)
+    assert settings.simulation is not None
+    moved = settings.simulation.hand.model_copy(update=hand)
+    simulation = settings.simulation.model_copy(update={"hand": moved})
+    settings = settings.model_copy(update={"schedule": (), "simulation": simulation})
+    cycles = round(DURATION_S / 1e-3)
+    assert simulate(settings, cycles, disturbances=late_from(cycles, begin)).lag == 1
+    lost = Disturbances.none(cycles)
+    lost.lost[begin] = True
+    assert simulate(settings, cycles, disturbances=lost).lag == 0
 
 
 @pytest.mark.parametrize("begin", [247, 298, 332])
