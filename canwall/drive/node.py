@@ -115,9 +115,12 @@ class DriveNode:
     def read(self, index: int, subindex: int = 0) -> int:
         """Read an integer. Raises DriveError."""
         raw = self._upload(index, subindex)
+        return int.from_bytes(raw, "little", signed=self.is_signed(index, subindex))
+
+    def is_signed(self, index: int, subindex: int = 0) -> bool:
+        """Return True if the dictionary has the object as an integer with a sign."""
         variable = self.dictionary.get_variable(index, subindex)
-        signed = variable is not None and variable.data_type in datatypes.SIGNED_TYPES
-        return int.from_bytes(raw, "little", signed=signed)
+        return variable is not None and variable.data_type in datatypes.SIGNED_TYPES
 
     def read_text(self, index: int) -> str:
         """Read a VISIBLE_STRING, "?" for what is not visible. Raises DriveError."""

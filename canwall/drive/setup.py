@@ -218,6 +218,9 @@ def _write_parameters(node: DriveNode, settings: DriveSettings) -> None:
         _download_dcf(node)
     for (index, subindex), value in settings.parameters_by_index.items():
         try:
+            # Written all the same it would be a large number, and the drive might keep it.
+            if value < 0 and node.has(index, subindex) and not node.is_signed(index, subindex):
+                raise DriveError(f"0x{index:04X}:{subindex:02X}: cannot be negative, as {value} is")
             node.set(index, subindex, value)
         except DriveError as error:
             raise DriveError(f"drive.parameters: {error}") from None

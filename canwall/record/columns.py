@@ -71,7 +71,7 @@ COLUMNS = (
     Column("force_applied", "f8", "N·m", "the wall's force then, out of it; without a probe"),
     Column("law", "u1", "", "law of the wall", names_law=True),
     Column("stiffness", "f8", "N·m/rad", "stiffness of the wall, as asked"),
-    Column("damping", "f8", "N·m·s/rad", "damping of the wall, in force"),
+    Column("damping", "f8", "N·m·s/rad", "damping of the wall in force; without the guard"),
     Column("cap", "f8", "", "cap as asked: of the stiffness in force, in mass/T²; 0: none"),
     Column(
         "damping_ratio", "f8", "", "damping ratio of the wall, as asked; 0: none, damping as given"

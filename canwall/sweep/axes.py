@@ -68,8 +68,9 @@ DEFAULTS: dict[str, tuple[Value, ...]] = {
     "speed": (0.5, 1.0, 2.0),
     "phase": (0.0, 0.35, 0.7),
 }
-#: Keys of the configuration that every strike sets anew, and the axes from which it does.
+#: Keys of the configuration that every strike sets anew, and the axes from which it does, if any.
 INSTEAD = {
+    "bus.cycle_s": "rate",
     "wall.law": "law",
     "wall.stiffness_nm_per_rad": "stiffness",
     "wall.damping_nm_s_per_rad": "damping",
@@ -79,6 +80,10 @@ INSTEAD = {
     "simulation.hand.press_s": "press",
     "simulation.hand.press_rad": "press_torque",
     "simulation.hand.press_torque_nm": "press_torque",
+    "simulation.hand.strikes": "",
+    "simulation.hand.first_strike_s": "",
+    "simulation.hand.interval_s": "",
+    "run.duration_s": "",
 }
 #: Axes of numbers that may be zero.
 _MAY_BE_ZERO = (

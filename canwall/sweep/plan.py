@@ -161,7 +161,8 @@ def make_plan(base: Settings, given: Mapping[str, object], through: str = "sim")
             axes = {n: a for n, a in axes.items() if n not in both or n in given}
     for key, instead in INSTEAD.items():
         if key in axes:
-            raise InputError(f"sweep axis {key}: use {instead} instead")
+            do = f"use {instead} instead" if instead else "it changes nothing; leave it out"
+            raise InputError(f"sweep axis {key}: {do}")
     defaults: dict[str, Any] = {"law": (named_law(base),)}
     defaults |= {name: DEFAULTS[name] for name in STRIKES}
     given_damping = next((axes[name] for name in DAMPING if name in axes), None)

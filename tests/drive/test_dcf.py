@@ -64,3 +64,12 @@ def test_parameter_that_has_no_room(make_rig: RigFactory) -> None:
     rig = make_rig(settings_with({"drive.parameters": {"0x6072": 70000}}))
     with pytest.raises(Exception, match=r"drive\.parameters: 0x6072:00: 0x11170 does not fit"):
         rig.set_up()
+
+
+def test_parameter_that_cannot_be_negative(make_rig: RigFactory) -> None:
+    """As a number without a sign -7 is a limit of 65 times the rated torque."""
+    rig = make_rig(settings_with({"drive.parameters": {"0x6072": -7}}))
+    before = rig.node.read(0x6072)
+    with pytest.raises(Exception, match=r"drive\.parameters: 0x6072:00: cannot be negative, as -7"):
+        rig.set_up()
+    assert rig.node.read(0x6072) == before

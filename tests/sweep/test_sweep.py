@@ -546,6 +546,8 @@ def test_a_law_that_does_not_return_is_named_with_its_point(tmp_path: Path, thro
         ({"law": "none"}, "wall.law: unknown law 'none'"),
         ({"wall.stiffness_nm_per_rad": "1"}, "use stiffness instead"),
         ({"simulation.hand.press_s": "0.1,0.5"}, "hand.press_s: use press instead"),
+        ({"bus.cycle_s": "0.001,0.002"}, "bus.cycle_s: use rate instead"),
+        ({"run.duration_s": "1,2"}, "run.duration_s: it changes nothing; leave it out"),
         ({"delay_error": "-1.5"}, "axis delay_error: -1.5 makes D = -0.5; it has to be between"),
         ({"friction": "-0.01"}, "axis friction: has to be at least 0"),
         ({"delay": "3.5"}, "axis delay: has to be at most 3"),
