@@ -13,7 +13,7 @@ from canwall.analysis import metrics
 from canwall.config import Settings
 from canwall.cycle import Trip
 from canwall.run.closed_loop import Disturbances, SimulatedRun, simulate
-from canwall.sweep.strike import strike_settings
+from canwall.sweep.strike import OPERATORS, strike_settings
 
 DURATION_S = 4.2
 #: Periods [s], and the stiffest wall of half_sample on a usual grid that holds in them.
@@ -207,12 +207,8 @@ def test_an_adapting_model_tells_lost_from_late(begin: int) -> None:
 @pytest.mark.parametrize("begin", [270, 400, 1210])
 def test_a_contact_that_begins_in_a_probe_tells_lost_from_late(begin: int) -> None:
     """On the first samples of its force, in a grip on the wall of config/sim.toml."""
-    hand = {"inertia_kg_m2": 3.2e-4, "damping_nm_s_per_rad": 0.0384, "stiffness_nm_per_rad": 5.12}
-    settings = config.load(SIM_CONFIG)
-    assert settings.simulation is not None
-    moved = settings.simulation.hand.model_copy(update=hand)
-    simulation = settings.simulation.model_copy(update={"hand": moved})
-    settings = settings.model_copy(update={"schedule": (), "simulation": simulation})
+    settings = config.with_overrides(config.load(SIM_CONFIG), OPERATORS["grip"].keys)
+    settings = settings.model_copy(update={"schedule": ()})
     cycles = round(DURATION_S / 1e-3)
     assert simulate(settings, cycles, disturbances=late_from(cycles, begin)).lag == 1
     lost = Disturbances.none(cycles)
