@@ -254,8 +254,8 @@ def take(
                 drive.received = complete
                 return _answer(core, k, data if complete else 0, complete, received_ns)
     elif core.stage == _SYNC_AWAITED and can_id == core.sync_id:
-        core.deadline_ns = now_ns + core.period_ns
         # Of a master that stood still, the SYNCs have waited; only the kernel knows how long.
+        core.deadline_ns = min(now_ns, wall_ns - core.wall_offset_ns) + core.period_ns
         since_ns = stamp_ns - core.sync_stamp_ns if stamp_ns and core.sync_stamp_ns else 0
         core.sync_stamp_ns = stamp_ns
         _begin_cycle(core, now_ns, since_ns)
@@ -291,10 +291,10 @@ def _start(core: Record, now_ns: int) -> int:
     if _record_is_behind(core):
         return _WRITER
     if core.external_sync:
-        core.until_ns = now_ns + core.sync_patience_ns
-        core.stage = _SYNC_AWAITED
-        return _FRAME
-    if core.real_time:
+        # In real time, SYNCs that have waited since the bus was opened are over.
+        if core.sync_ns or not core.real_time:
+            return _await_sync(core, now_ns)
+    elif core.real_time:
         if core.deadline_ns == 0:
             core.deadline_ns = now_ns
         if core.deadline_ns - now_ns > SPIN_NS:
@@ -305,12 +305,22 @@ def _start(core: Record, now_ns: int) -> int:
 
 
 @compiled
+def _await_sync(core: Record, now_ns: int) -> int:
+    """Wait for the SYNC of another producer."""
+    core.until_ns = now_ns + core.sync_patience_ns
+    core.stage = _SYNC_AWAITED
+    return _FRAME
+
+
+@compiled
 def _send_sync(core: Record, now_ns: int) -> int:
     """Send the SYNC when it is due, after all earlier frames were processed."""
     if core.stage == _DRAINING:
         if core.urgent:
             core.stage = _BEFORE
             return _urgent(core)
+        if core.external_sync:
+            return _await_sync(core, now_ns)
         core.stage = _SYNC_DUE
     if core.real_time:
         if now_ns - core.deadline_ns > core.period_ns // 2:

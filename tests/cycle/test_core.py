@@ -362,12 +362,58 @@ def test_no_sync_is_skipped_in_simulated_time(bench: Bench) -> None:
 
 def test_external_sync_is_skipped_by_the_kernels_stamp() -> None:
     bench = Bench(real_time=True, external_sync=True)
+    assert bench.begin() == Want.DRAIN
     for stamp, skipped in ((1, 0), (2, 0), (5, 2), (6, 2)):
+        bench.proceed()
         bench.begin()
         bench.now_ns += 50 * PERIOD_NS  # frames that have waited for the master
         bench.take(SYNC, stamp_ns=START_NS + stamp * PERIOD_NS)
         bench.take(TPDO + 5, tpdo())
         assert bench.axes[0].cycle["skipped_sync"][0] == skipped
+
+
+def test_rpdo_on_an_external_sync_that_has_waited_is_late() -> None:
+    """The next SYNC is on the bus already, though the master has not seen it."""
+    bench = Bench(real_time=True, external_sync=True)
+    bench.begin()
+    bench.proceed()
+    late = []
+    for waited_ns in (100_000, 900_000, 1_100_000, 100_000):
+        bench.begin()
+        bench.now_ns += PERIOD_NS
+        bench.take(SYNC, stamp_ns=bench.now_ns - waited_ns)
+        bench.take(TPDO + 5, tpdo())
+        late.append((bench.axes[0].late_rpdo, bench.axes[0].late_in_a_row))
+    assert late == [(0, 0), (0, 0), (1, 1), (1, 0)]
+
+
+def test_external_syncs_before_the_first_cycle_are_over() -> None:
+    bench = Bench(real_time=True, external_sync=True)
+    assert bench.begin() == Want.DRAIN
+    for _ in range(50):
+        assert bench.take(SYNC) == Want.DRAIN
+        assert bench.take(TPDO + 5, tpdo()) == Want.DRAIN
+    while bench.proceed() != Want.FRAME:
+        pass
+    assert bench.sent == []
+    bench.take(SYNC)
+    assert bench.take(TPDO + 5, tpdo()) == Want.DONE
+    assert bench.sent == [RPDO + 5]
+
+
+@pytest.mark.parametrize(("factor", "told"), [(1.0, False), (1.25, True), (0.5, True)])
+def test_external_sync_with_another_period_is_found(factor: float, told: bool) -> None:
+    period_ns = round(factor * PERIOD_NS)
+    bench = Bench(real_time=True, external_sync=True)
+    bench.begin()
+    bench.proceed()
+    for _ in range(20):
+        bench.begin()
+        bench.now_ns += period_ns
+        bench.take(SYNC)
+        bench.take(TPDO + 5, tpdo())
+    found_s = bench.exchange.other_period_s
+    assert found_s == (pytest.approx(period_ns * 1e-9, rel=1.0 / 32.0) if told else None)
 
 
 def test_tpdo_after_its_window_is_a_late_one() -> None:
