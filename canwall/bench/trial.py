@@ -126,6 +126,13 @@ class Trial:
             (int(axis.cycle["missed_tpdo"][0]) - missed) / count,
             (axis.late_rpdo - late) / count,
         )
+        if (found_s := loop.exchange.other_period_s) is not None:
+            findings.add_trouble(
+                "latency",
+                "SYNC",
+                f"comes every {found_s * 1e3:.3g} ms, but bus.cycle_s is {period * 1e3:g} ms",
+                "correct it, or the producer of the SYNC",
+            )
         if self._move and self._first_motion(axis, loop):
             return True
         if watchdog.kind != "none":

@@ -25,7 +25,7 @@ from canwall.cycle.transport import CycleFrames, TransportFactory
 from canwall.drive import Link, Watchdog
 from canwall.drive.watchdog import ErrorControlFrame
 from canwall.record import Phase
-from canwall.record.histogram import HISTOGRAM
+from canwall.record.histogram import HISTOGRAM, percentile_ns
 from canwall.record.ring import FRAME, HEADER, RECEIVED, Ring, to_message
 
 #: Time after which a TPDO counts as lost in simulated time, where nothing is late.
@@ -36,6 +36,8 @@ _MISSING_TIMEOUT_S = 0.05
 _SYNCHRONOUS_WINDOW = 0.8
 #: Time without progress after which the writer counts as dead; lost items are counted.
 _WRITER_PATIENCE_S = 10.0
+#: Part of the period by which the median interval of SYNCs may be off, half of it by its bucket.
+_OFF_PERIOD = 1.0 / 16.0
 #: Time without a SYNC, and the least number of periods, after which its producer counts as silent.
 _SYNC_PATIENCE_S, _SYNC_PATIENCE_CYCLES = 0.1, 10
 
@@ -204,6 +206,15 @@ class Exchange:
         for axis in self.axes:
             _check_late(axis)
         self.transport.finish_cycle()
+
+    @property
+    def other_period_s(self) -> float | None:
+        """Period of another producer's SYNC that is not that of the walls [s]; None: it is."""
+        if not (self._core["external_sync"][0] and self._real_time):
+            return None
+        found_s = percentile_ns(self.sync_interval, 50.0) * 1e-9
+        off = found_s and abs(found_s / self._period_s - 1.0) > _OFF_PERIOD
+        return found_s if off else None
 
     def warm_up(self) -> None:
         """Have the laws loaded, which happens at their first call and may take longer than a cycle.

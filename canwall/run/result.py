@@ -109,6 +109,7 @@ def write_result(
         notes,
         [
             *remarks,
+            *_remarks_on_sync(exchange, settings.bus.cycle_s),
             *_remarks_on_lag(axis),
             *_remarks_on_delay(axis, summary["motion_delay_cycles"]),
             *_remarks_on_guard(axis),
@@ -176,6 +177,15 @@ def _delay_of(signals: "pa.Table") -> list[float] | None:
     position = np.where(received & on_the_wall, numbers(signals, "position_rad"), np.nan)
     found = delay_in_record(position, numbers(signals, "torque_cmd"))
     return None if found is None else list(found)
+
+
+def _remarks_on_sync(exchange: Exchange, cycle_s: float) -> list[str]:
+    if (found_s := exchange.other_period_s) is None:
+        return []
+    return [
+        f"the SYNC came every {found_s * 1e3:.3g} ms, but bus.cycle_s is {cycle_s * 1e3:g} ms, "
+        f"with which the laws reckon: correct it, or the producer of the SYNC"
+    ]
 
 
 def _remarks_on_lag(axis: WallAxis) -> list[str]:

@@ -143,6 +143,13 @@ def test_cycle_that_fails_leaves_the_drive_disabled(
     assert rig.node.read(0x6071) == 0
 
 
+def test_sync_of_another_period_is_a_trouble(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Exchange, "other_period_s", property(lambda exchange: 0.00125))
+    findings, _ = examined(rig)
+    assert found(findings, "latency", "SYNC") == "comes every 1.25 ms, but bus.cycle_s is 1 ms"
+    assert not findings.well
+
+
 @pytest.mark.slow
 def test_command_in_plain_lines(tmp_path: Path) -> None:
     # On a machine in use 0.1 s of silence come about by themselves.

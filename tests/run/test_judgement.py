@@ -1,7 +1,8 @@
 """Judgement of a run by what is felt: the estimate from the torque beside the force itself."""
 
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
@@ -15,12 +16,13 @@ from canwall import config
 from canwall.analysis.felt import band_rms, felt_band
 from canwall.cli.run import _strike_table, _tell
 from canwall.config import Settings
+from canwall.cycle import Exchange
 from canwall.record import ROW, Phase, read_signals
 from canwall.record.columns import record_batch
 from canwall.record.pictures import draw_run, verdict
 from canwall.run import run
 from canwall.run.closed_loop import SIGNALS, ClosedLoop, simulate, simulate_loop
-from canwall.run.result import judged
+from canwall.run.result import _remarks_on_sync, judged
 from canwall.sweep.axes import settings_at
 from canwall.sweep.strike import PreparedStrike
 
@@ -250,3 +252,11 @@ def test_chatter_without_a_frequency_is_said_without() -> None:
         console.print(_strike_table([judgement]))
     assert "Hz" not in capture.get()
     assert verdict(judgement) == "chatter"
+
+
+@pytest.mark.parametrize(("found_s", "remarks"), [(None, 0), (0.00125, 1)])
+def test_sync_of_another_period_is_told(found_s: float | None, remarks: int) -> None:
+    exchange = cast(Exchange, SimpleNamespace(other_period_s=found_s))
+    told = _remarks_on_sync(exchange, 0.001)
+    assert len(told) == remarks
+    assert all("every 1.25 ms, but bus.cycle_s is 1 ms" in text for text in told)
