@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from canwall.analysis.analytic_limits import stable_stiffness
+from canwall.config import short_law
 from canwall.errors import InputError
 from canwall.figure_style import CHATTER, DPI, REFERENT, STYLE, line_style
 from canwall.sweep.axes import DAMPING, STIFFNESS, STRIKES
@@ -33,6 +34,8 @@ _PANELS = 6
 _PANEL_IN, _MARGIN_IN = 3.5, 1.0
 #: Letters of a legend per inch, and those that the handle of an entry and its gaps take.
 _LETTERS_PER_INCH, _HANDLE_LETTERS = 13.0, 9
+#: Letters of a line of a panel's title, as wide as its axes.
+_TITLE_LETTERS = 38
 
 Draw = Callable[[Axes, xr.Dataset], None]
 _Kind: TypeAlias = tuple[str, xr.Dataset, tuple[str, ...], Draw]
@@ -130,7 +133,8 @@ def _draw_panels(dataset: xr.Dataset, drawn: tuple[str, ...], draw: Draw) -> lis
         for position, point in enumerate(of_figure, start=1):
             axes = figure.add_subplot(rows, columns, position)
             draw(axes, dataset.isel(dict(zip(others, point, strict=True))))
-            axes.set_title(panel_title(dataset, dict(zip(others, point, strict=True))))
+            title = panel_title(dataset, dict(zip(others, point, strict=True)))
+            axes.set_title(textwrap.fill(title, _TITLE_LETTERS, break_on_hyphens=False))
         parameters = textwrap.fill(shared_parameters(dataset), round(13 * width))
         figure.suptitle(parameters, fontsize=9, color="0.3", x=0.01, ha="left")
         handles, labels = _legend(figure)
@@ -165,7 +169,7 @@ def _limit_over(axis: str) -> Draw:
             one = dataset.sel(law=law)
             worst = one["worst_normalised"].values
             best = (one["limit"].max(STRIKES) * one["period"] ** 2 / one["inertia"]).values
-            axes.plot(x, worst, ms=4, mfc="none", label=law, **style)
+            axes.plot(x, worst, ms=4, mfc="none", label=short_law(law), **style)
             axes.fill_between(x, worst, best, color=style["color"], alpha=0.08, lw=0)
         linear = _linear_limit(dataset.isel(law=0), axis)
         if linear is not None:
@@ -203,10 +207,11 @@ def _limits_by_law(axes: Axes, dataset: xr.Dataset) -> None:
         strikes = (one["limit"] * one["period"] ** 2 / one["inertia"]).values.ravel()
         axes.plot(strikes, np.full(strikes.shape, row), ".", color=colour, alpha=0.5)
         axes.plot(one["worst_normalised"].item(), row, "D", color=colour)
-    axes.set_yticks(range(dataset.sizes["law"]), [law for law, _ in _styles(dataset)])
+    axes.set_yticks(range(dataset.sizes["law"]), [short_law(law) for law, _ in _styles(dataset)])
     axes.invert_yaxis()
-    axes.set_xscale("log")
-    label_logarithmic(axes.xaxis)
+    if dataset["limit"].max() > 0:
+        axes.set_xscale("log")
+        label_logarithmic(axes.xaxis)
     axes.set_xlabel("K-limit, K·T²/m [1] (◆ worst, · each strike)")
 
 
@@ -226,7 +231,7 @@ def _energy(stiffness: str) -> Draw:
             worst = one["energy_out"].max(STRIKES).values * 1e6
             chatters = one["chatters"].any(STRIKES).values
             x = one[stiffness].values
-            axes.plot(x, worst, label=law, **style | {"marker": ""})
+            axes.plot(x, worst, label=short_law(law), **style | {"marker": ""})
             axes.plot(x[chatters], worst[chatters], "x", color=CHATTER, ms=5, zorder=3)
         # One count times the peak torque: the resolution of the energy.
         tolerance = dataset["energy_tolerance"].max((*STRIKES, "law")).values * 1e6
@@ -250,7 +255,9 @@ def _amplitude(stiffness: str) -> Draw:
     def draw(axes: Axes, dataset: xr.Dataset) -> None:
         for law, style in _styles(dataset):
             worst = dataset["amplitude"].sel(law=law).max(STRIKES).values * 1e3
-            axes.plot(dataset[stiffness].values, worst, ms=3, mfc="none", label=law, **style)
+            axes.plot(
+                dataset[stiffness].values, worst, ms=3, mfc="none", label=short_law(law), **style
+            )
         axes.set_yscale("symlog", linthresh=0.01)
         # No chatter is drawn as zero: keep that line off the axis.
         axes.set_ylim(bottom=-0.001)
@@ -267,7 +274,7 @@ def _frequency(stiffness: str) -> Draw:
             x = np.repeat(dataset[stiffness].values, frequency.shape[1])
             chatters = frequency.ravel() > 0.0
             points = style | {"ls": "none", "mfc": "none", "ms": 4}
-            axes.plot(x[chatters], frequency.ravel()[chatters], label=law, **points)
+            axes.plot(x[chatters], frequency.ravel()[chatters], label=short_law(law), **points)
         axes.set_ylim(0.0, max(axes.get_ylim()[1], 10.0))
         _label_over_stiffness(axes, dataset, stiffness, "frequency of chatter, each strike [Hz]")
 

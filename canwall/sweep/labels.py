@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
+from canwall.config import short_law
 from canwall.sweep.axes import STRIKES
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ def panel_title(dataset: xr.Dataset, point: dict[str, int]) -> str:
         if dataset.sizes[name] > 1 or name in ("law", "operator"):
             title = _TITLES.get(name, "{}" if name == "law" else f"{name} = {{}}")
             value = dataset[name].values[index]
-            parts.append(title.format(value if isinstance(value, str) else f"{value:g}"))
+            parts.append(title.format(short_law(value) if isinstance(value, str) else f"{value:g}"))
     return ", ".join(parts)
 
 

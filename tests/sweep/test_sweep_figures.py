@@ -163,6 +163,29 @@ def test_each_strike_is_drawn_where_the_worst_chatters_on_every_wall(
     np.testing.assert_allclose(strikes.get_xdata(), [0.0, best.item()])
 
 
+def test_limits_of_zero_alone_can_be_drawn(tmp_path: Path, drawn: dict[str, Figure]) -> None:
+    limits = swept(tmp_path / "a.nc", speed=1, phase=0, law="standard")
+    limits["worst"][:] = limits["worst_normalised"][:] = limits["limit"][:] = 0.0
+    write_sweep_figures(limits, tmp_path / "a")
+    axes = drawn["a-limits"].axes[0]
+    low, high = axes.get_xlim()
+    assert all(low < x < high for one in axes.get_lines() for x in one.get_xdata())
+
+
+@pytest.mark.slow
+def test_long_names_of_laws_and_axes_have_room(tmp_path: Path, drawn: dict[str, Figure]) -> None:
+    law = f"{Path(__file__).parents[2] / 'docs' / 'my_law.py'}:my_law"
+    axes: dict[str, Any] = {"law": ["standard", law], "speed": 1, "phase": 0, "press": 0.1}
+    several = {"sync_jitter": [0.0, 5e-5], "simulation.viscous_nm_s_per_rad": [0.0005, 0.001]}
+    walls = swept(tmp_path / "a.nc", stiffness=[5.0, 10.0], damping=[0.0, 0.01], **axes, **several)
+    write_sweep_figures(walls, tmp_path / "a")
+    write_sweep_figures(swept(tmp_path / "b.nc", **axes), tmp_path / "b")
+    assert drawn["a-energy"].legends[0].get_texts()[1].get_text() == "my_law.py:my_law"
+    assert drawn["b-limits"].axes[0].get_yticklabels()[1].get_text() == "my_law.py:my_law"
+    for figure in drawn.values():
+        assert_nothing_overlaps(figure)
+
+
 @pytest.mark.slow
 def test_limits_of_one_condition_and_what_cannot_be_drawn(tmp_path: Path) -> None:
     limits = swept(tmp_path / "limits.nc", law=["standard", "midpoint"])
