@@ -21,6 +21,13 @@ _SERVO_DRIVE = 0x20192
 TORQUE_LIMITS = (0x6072, 0x6073, 0x60E0, 0x60E1)
 """Objects that hold the torque, in per mille of the rated one."""
 
+_SCALES = {
+    0x6076: "simulation.rated_torque_nm",
+    0x608F: "simulation.counts_per_rev",
+    0x6091: "drive.gear_ratio",
+}
+"""Objects in which 0 stands for a value that the file leaves out, and the keys that give it."""
+
 
 def make_drive(
     drive: DriveSettings,
@@ -105,6 +112,9 @@ def _dictionary(drive: DriveSettings, simulation: Simulation, node_id: int) -> D
     """Read the drive's dictionary, completed from the simulation."""
     dictionary = Dictionary.load(drive.eds, node_id)
     for (index, subindex), value in simulation.objects_by_index.items():
+        if value == 0 and index in _SCALES:
+            do = f"leave it out of simulation.objects, and {_SCALES[index]} sets it"
+            raise dictionary.error(index, subindex, f"cannot be 0; {do}")
         dictionary.power_on_with(index, subindex, value)
     dictionary.supply(0x1000, 0, _SERVO_DRIVE)
     dictionary.supply(0x6076, 0, round(simulation.rated_torque_nm / _rated_unit_nm(drive)))

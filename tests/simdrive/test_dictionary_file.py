@@ -7,8 +7,9 @@ import canopen
 import pytest
 from simdrive_bench import EDS, NODE_ID, PERIOD_S, Bench, RecordingMotion
 
+from canwall.config import Drive, Simulation
 from canwall.eds import DictionaryError
-from canwall.simdrive import Dictionary, ServoDrive
+from canwall.simdrive import Dictionary, ServoDrive, make_drive
 
 
 def sections() -> RawConfigParser:
@@ -103,6 +104,20 @@ def test_bad_file(tmp_path: Path, old: str, new: str, reason: str) -> None:
     message = str(refused.value)
     assert message.startswith(f"{path}: {reason}")
     assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [
+        ("0x6076", "simulation.rated_torque_nm"),
+        ("0x608F:01", "simulation.counts_per_rev"),
+        ("0x6091:01", "drive.gear_ratio"),
+    ],
+)
+def test_scale_of_zero_names_the_key(name: str, key: str) -> None:
+    settings = Drive(node_id=NODE_ID, eds=EDS)
+    with pytest.raises(DictionaryError, match=f"{name}.* cannot be 0.*{key}"):
+        make_drive(settings, Simulation(objects={name: 0}), PERIOD_S)
 
 
 def test_missing_file(tmp_path: Path) -> None:
