@@ -95,7 +95,9 @@ def examine(
                 describe_budget(node, setup, settings, findings)
                 Trial(node, setup, settings, announce, findings, move).make()
     finally:
-        announce("putting the drive back as it was")
+        patience = f"{settings.drive.sdo_timeout_s:g} s for each if the drive does not answer"
+        changes = 0 if node is None else node.changes
+        announce(f"putting the drive back as it was: {changes} values, {patience}")
         failures = [] if node is None else node.restore()
         if failures:
             more = f", and {len(failures) - 1} more" if len(failures) > 1 else ""

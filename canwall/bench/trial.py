@@ -54,6 +54,7 @@ _BY_ERROR_CODE = {
     "825": "look to the bus and to drive.watchdog_s",
     "82": "look for somebody else who sends PDOs to the drive",
     "86": "the vendor's tool has the limits of position and speed",
+    "87": "look for what keeps SYNC from the drive, or from its time (0x1006, bus.cycle_s)",
     "9": "release the emergency stop or safe torque off, and look to its wiring",
 }
 _INTERLOCK, _VOLTAGE_ENABLED = 1 << 3, 1 << 4
@@ -99,6 +100,8 @@ class Trial:
                 self._node.link.on_error_frame = both
                 outcome = run_loop(exchange, lambda loop: self._try(axis, loop))
             was_enabled = len(findings.lines) > enabled
+            if outcome.trips:
+                self._announce("asking the drive for the cause of its end")
             for trip in outcome.trips:
                 section = "cycle" if was_enabled else "enabling"
                 findings.add_trouble(section, "0x6041", trip, self._cause(trip))

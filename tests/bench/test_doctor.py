@@ -1,6 +1,7 @@
 """`canwall doctor`: what it finds, what it tests, and that nothing of it stays."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -64,6 +65,9 @@ def test_all_is_well(rig: Rig) -> None:
         "falling",
         "putting",
     ]
+    # A drive that has fallen silent makes it long.
+    patience = f"{rig.settings.drive.sdo_timeout_s:g} s for each if the drive does not answer"
+    assert re.search(rf" [1-9]\d* values, {re.escape(patience)}$", announced[-1])
 
 
 def test_torque_is_zero_all_the_time(rig: Rig) -> None:
@@ -120,8 +124,9 @@ def test_limit_beyond_what_the_drive_gives(make_rig: RigFactory) -> None:
 def test_a_drive_that_fails_is_put_back_as_well(rig: Rig) -> None:
     before = rig.node.read(0x6007)
     rig.tampering.mute.add(0x185)
-    findings, _ = examined(rig)
+    findings, announced = examined(rig)
     assert "no TPDO within" in found(findings, "enabling", "0x6041")
+    assert "asking the drive for the cause of its end" in announced
     assert rig.node.read(0x6007) == before
 
 
