@@ -157,10 +157,7 @@ def _tell(results: "Sequence[RunResult]", as_json: bool) -> int:
 
 def _run_settings(path: Path, overrides: dict[str, Any]) -> "Settings":
     settings = settings_from(path, **overrides)
-    return settings.without_replacements(
-        law=overrides["wall__law"] is not None,
-        damping=overrides["wall__damping_nm_s_per_rad"] is not None,
-    )
+    return settings.without_replacements(law=overrides["wall__law"] is not None)
 
 
 def change(

@@ -59,6 +59,13 @@ def _check_damping(raw: dict[str, Any]) -> None:
         )
 
 
+def _damped_as_given(values: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return overrides in which a damping that is given takes the place of the damping ratio."""
+    return (
+        {"wall.damping_ratio": 0.0, **values} if "wall.damping_nm_s_per_rad" in values else values
+    )
+
+
 def load(path: Path, overrides: Mapping[str, Any] | None = None) -> Settings:
     """Read and validate a TOML file.
 
@@ -92,7 +99,7 @@ def parse(text: str, path: Path, overrides: Mapping[str, Any] | None = None) -> 
         check_values(raw)
         _convert_metric_keys(raw)
         _check_damping(raw)
-        for dotted, value in (overrides or {}).items():
+        for dotted, value in _damped_as_given(overrides or {}).items():
             section, key = dotted.split(".")
             table = raw.setdefault(section, {})
             if isinstance(table, dict):
@@ -129,7 +136,7 @@ def check_values(raw: Mapping[str, Any]) -> None:
 def with_overrides(settings: Settings, values: Mapping[str, Any]) -> Settings:
     """Return the settings with other values by dotted key, validated again. Raises ConfigError."""
     raw = settings.model_dump()
-    for dotted, value in values.items():
+    for dotted, value in _damped_as_given(values).items():
         *sections, key = dotted.split(".")
         table = raw
         for section in sections:

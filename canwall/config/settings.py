@@ -452,18 +452,12 @@ class Settings(Section):
         }
         return self.model_copy(update=update)
 
-    def without_replacements(self, *, law: bool, damping: bool) -> Self:
-        """Return the same without what would replace a given law, or a given damping.
-
-        Changes of law in `[[schedule]]` replace the law, the damping ratio the damping.
-        """
-        update: dict[str, Any] = {}
-        if damping:
-            update["wall"] = self.wall.model_copy(update={"damping_ratio": 0.0})
-        if law:
-            changes = (change.model_copy(update={"law": None}) for change in self.schedule)
-            update["schedule"] = tuple(changes)
-        return self.model_copy(update=update)
+    def without_replacements(self, *, law: bool) -> Self:
+        """Return the same without the changes in `[[schedule]]` that would replace a given law."""
+        if not law:
+            return self
+        changes = (change.model_copy(update={"law": None}) for change in self.schedule)
+        return self.model_copy(update={"schedule": tuple(changes)})
 
     @property
     def masses(self) -> tuple[float, float]:

@@ -76,4 +76,4 @@ def wall_settings(
         "run.duration_s": duration,
     }
     settings = load(settings, {key: value for key, value in given.items() if value is not None})
-    return settings.without_replacements(law=law is not None, damping=damping is not None)
+    return settings.without_replacements(law=law is not None)

@@ -11,7 +11,16 @@ import tomli_w
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from canwall.config import ConfigError, Guard, Operator, Settings, Wall, load, shipped
+from canwall.config import (
+    ConfigError,
+    Guard,
+    Operator,
+    Settings,
+    Wall,
+    load,
+    shipped,
+    with_overrides,
+)
 from canwall.errors import InputError
 
 BOUNDED = settings(derandomize=True, deadline=None, max_examples=200)
@@ -90,6 +99,23 @@ def test_a_wall_is_damped_and_capped_unless_it_is_said_otherwise(
 ) -> None:
     found = loaded(wall).wall
     assert (found.law, found.damping_ratio, found.cap) == (law, ratio, cap)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "ratio"),
+    [
+        ({"wall.damping_nm_s_per_rad": 0.0}, 0.0),
+        ({"wall.damping_nm_s_per_rad": 0.1}, 0.0),
+        ({"wall.damping_nm_s_per_rad": 0.0, "wall.damping_ratio": 0.7}, 0.7),
+    ],
+)
+def test_a_damping_in_place_of_the_file_s_replaces_its_ratio(
+    overrides: dict[str, object], ratio: float
+) -> None:
+    sim = shipped("config/sim.toml")
+    assert load(sim).wall.damping_ratio == 0.5
+    assert load(sim, overrides).wall.damping_ratio == ratio
+    assert with_overrides(load(sim), overrides).wall.damping_ratio == ratio
 
 
 def test_defaults_of_a_wall_are_those_of_the_shipped_configuration() -> None:
