@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from canwall.config import short_law
 from canwall.errors import InputError
 from canwall.extras import need
 from canwall.panel.frames import SIGNALS, signals_frame
@@ -214,4 +213,6 @@ def _is_same(one: float, other: float) -> bool:
 
 
 def _shown(value: Any) -> str:
-    return short_law(value) if isinstance(value, str) else f"{value:g}"
+    from canwall.sweep.labels import value_text
+
+    return value_text(value)

@@ -22,6 +22,7 @@ from canwall.sweep.axes import DAMPING, STIFFNESS, STRIKES
 from canwall.sweep.labels import (
     LABELS,
     axis_name,
+    has_damping_ratio,
     label_logarithmic,
     panel_title,
     shared_parameters,
@@ -173,7 +174,8 @@ def _limit_over(axis: str) -> Draw:
             axes.fill_between(x, worst, best, color=style["color"], alpha=0.08, lw=0)
         linear = _linear_limit(dataset.isel(law=0), axis)
         if linear is not None:
-            axes.plot(x, linear, "k--", lw=1.0, label="spring and damper, linear, exact")
+            walls = "spring alone" if has_damping_ratio(dataset) else "spring and damper"
+            axes.plot(x, linear, "k--", lw=1.0, label=f"{walls}, linear, exact")
         if dataset["worst_normalised"].max() > 0:
             axes.set_yscale("log")
             label_logarithmic(axes.yaxis)

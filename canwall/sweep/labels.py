@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from canwall.config import short_law
-from canwall.sweep.axes import STRIKES
+from canwall.sweep.axes import DAMPING, STRIKES
 
 if TYPE_CHECKING:
     from matplotlib.axis import Axis
@@ -39,6 +39,7 @@ _TITLES = {
     "model": "model: {}",
     "operator": "operator: {}",
 }
+_RATIO = "wall.damping_ratio"
 
 
 def axis_name(dataset: xr.Dataset, names: tuple[str, ...]) -> str:
@@ -59,6 +60,13 @@ def label_logarithmic(axis: "Axis") -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
+def value_text(value: str | float | bool | np.bool_) -> str:
+    """Return the text of a value on an axis: a name, a number, or true and false as in TOML."""
+    if isinstance(value, str):
+        return short_law(value)
+    return str(value).lower() if isinstance(value, bool | np.bool_) else f"{value:g}"
+
+
 def panel_title(dataset: xr.Dataset, point: dict[str, int]) -> str:
     """Return the title of a panel: the values in which it differs from the others.
 
@@ -69,7 +77,7 @@ def panel_title(dataset: xr.Dataset, point: dict[str, int]) -> str:
         if dataset.sizes[name] > 1 or name in ("law", "operator"):
             title = _TITLES.get(name, "{}" if name == "law" else f"{name} = {{}}")
             value = dataset[name].values[index]
-            parts.append(title.format(short_law(value) if isinstance(value, str) else f"{value:g}"))
+            parts.append(title.format(value_text(value)))
     return ", ".join(parts)
 
 
@@ -89,18 +97,26 @@ def shared_parameters(dataset: xr.Dataset) -> str:
         values = np.unique(dataset[name].values)
         if len(values) == 1:
             parts.append(text.format(values[0] * scale))
-    # An axis that the figure shows at one of its values.
-    for name in ("damping", "damping_normalised"):
-        if name in dataset.coords and name not in dataset.dims:
-            value = dataset[name].item()
-            ratio = None if value else _damping_ratio(dataset)
-            parts.append(_TITLES[name].format(f"{value:g}") if ratio is None else f"ζ = {ratio:g}")
+    damping = dataset[axis_name(dataset, DAMPING)]
+    if damping.size == 1:
+        value = damping.item()
+        ratios = [0.0] if value else _damping_ratios(dataset)
+        if ratios == [0.0]:
+            parts.append(_TITLES[str(damping.name)].format(f"{value:g}"))
+        elif len(ratios) == 1:
+            parts.append(f"ζ = {ratios[0]:g}")
     strikes = math.prod(dataset.sizes[name] for name in STRIKES)
     parts.append("1 strike" if strikes == 1 else f"the worst of {strikes} strikes")
     return ", ".join(parts)
 
 
-def _damping_ratio(dataset: xr.Dataset) -> float | None:
-    """Return the damping ratio of the configuration, which stands in for a damping of 0."""
-    ratio: float = tomllib.loads(dataset.attrs["configuration"])["wall"]["damping_ratio"]
-    return ratio or None
+def has_damping_ratio(dataset: xr.Dataset) -> bool:
+    """Return True if a damping ratio is in force anywhere, in place of a damping of 0."""
+    return any(_damping_ratios(dataset))
+
+
+def _damping_ratios(dataset: xr.Dataset) -> list[float]:
+    """Return the damping ratios, of an axis or of the configuration."""
+    if _RATIO in dataset.coords:
+        return [float(ratio) for ratio in np.atleast_1d(dataset[_RATIO].values)]
+    return [tomllib.loads(dataset.attrs["configuration"])["wall"]["damping_ratio"]]

@@ -9,9 +9,8 @@ import xarray as xr
 from rich.markup import escape
 from rich.table import Table
 
-from canwall.config import short_law
 from canwall.sweep.axes import DAMPING, STIFFNESS, STRIKES
-from canwall.sweep.labels import LABELS, axis_name
+from canwall.sweep.labels import LABELS, axis_name, value_text
 
 
 def sweep_table(dataset: xr.Dataset) -> Table:
@@ -133,5 +132,5 @@ def _conditions(
         for name, i in index.items():
             if dataset.sizes[name] > 1 or name == "law":
                 value = dataset[name].values[i]
-                labels[name] = short_law(value) if isinstance(value, str) else f"{value:g}"
+                labels[name] = value_text(value)
         yield labels, index

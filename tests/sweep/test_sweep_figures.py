@@ -16,9 +16,9 @@ from rig import settings_with
 
 from canwall.analysis.analytic_limits import CEILINGS, delayed_stiffness, stable_stiffness
 from canwall.errors import InputError
-from canwall.sweep import make_plan, read_sweep, sweep
+from canwall.sweep import make_plan, read_sweep, sweep, sweep_table
 from canwall.sweep.figures import write_sweep_figures
-from canwall.sweep.labels import shared_parameters
+from canwall.sweep.labels import panel_title, shared_parameters
 
 STRIKE: dict[str, Any] = {"speed": [1.0], "phase": [0.0, 0.5], "press": 0.3}
 
@@ -222,3 +222,27 @@ def test_damping_ratio_stands_where_a_damping_would(tmp_path: Path) -> None:
     assert "ζ = 0.5" in shared_parameters(of_ratio.isel(damping=0))
     undamped = swept(tmp_path / "b.nc", stiffness=[5.0, 10.0])
     assert "B = 0 N·m·s/rad," in shared_parameters(undamped.isel(damping=0))
+    ratios = {"stiffness": [5.0, 10.0], "wall.damping_ratio": [0.0, 0.3]}
+    of_axis = sweep(make_plan(settings, {**STRIKE, **ratios}), tmp_path / "a.nc")
+    # The titles of the panels have it.
+    assert "ζ" not in shared_parameters(of_axis)
+    assert "ζ = 0.3" in shared_parameters(of_axis.isel({"wall.damping_ratio": 1}))
+
+
+def test_damping_of_k_limits_is_told(tmp_path: Path, drawn: dict[str, Figure]) -> None:
+    given = {**STRIKE, "law": "standard", "rate": [900, 1000], "phase": 0.0}
+    for ratio, told, walls in ((0.5, "ζ = 0.5", "alone"), (0.0, "B = 0 N·m·s/rad", "and damper")):
+        settings = settings_with({"wall.damping_ratio": ratio})
+        limits = sweep(make_plan(settings, given), tmp_path / f"{ratio}.nc")
+        write_sweep_figures(limits, tmp_path / "k")
+        figure = drawn["k-limit-over-rate"]
+        assert told in figure.get_suptitle().replace("\n", " ")
+        assert len(line(figure, 0, f"spring {walls}, linear, exact")) == 2
+
+
+def test_true_and_false_are_called_so(tmp_path: Path) -> None:
+    axis = {"stiffness": [5.0, 10.0], "operator.adapt": [True, False]}
+    dataset = swept(tmp_path / "a.nc", law=["standard"], **axis)
+    assert panel_title(dataset, {"operator.adapt": 1}) == "operator.adapt = false"
+    column = sweep_table(dataset).columns[1]
+    assert (column.header, [*column.cells]) == ("operator.adapt", ["true", "false"])
