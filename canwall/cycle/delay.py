@@ -112,9 +112,22 @@ class DelayTest:
         try:
             delay = self._fit.result() if self._fit else self.measured()
         except ValueError as error:
-            raise ExperimentError(axis, str(error)) from None
+            raise ExperimentError(axis, f"{error}{self._strike()}") from None
         axis.delay = _upper_end(delay)
         set_delay(axis.cycle, axis.settings, axis.delay)
+
+    def _strike(self) -> str:
+        """Say that a simulated hand has struck before the end of the measurement; else empty."""
+        settings = self.axis.settings
+        hand = settings.simulation and settings.simulation.hand
+        if not hand or not hand.strikes or hand.script or hand.random:
+            return ""
+        if hand.first_strike_s > int(self.axis.cycle["j"][0]) * settings.bus.cycle_s:
+            return ""
+        return (
+            f"; the simulated hand struck meanwhile, at {hand.first_strike_s:g} s: without "
+            f"simulation.hand.first_strike_s it waits for the measurement"
+        )
 
     def _prepared(self) -> Delay:
         """Return D, with the gains for it computed and kept.

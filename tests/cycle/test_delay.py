@@ -192,6 +192,21 @@ def test_loop_measures_the_delay_that_the_drive_was_given(
     assert np.ptp(measuring["position_rad"]) < 0.05
 
 
+@pytest.mark.parametrize(("first_s", "told"), [(0.2, True), (2.0, False)])
+def test_strike_during_the_measurement_is_told(
+    make_rig: RigFactory, first_s: float, told: bool
+) -> None:
+    settings = {
+        "estimator.measure_delay": True,
+        "simulation.coulomb_nm": 0.5,  # which the torques do not move
+        "simulation.hand.first_strike_s": first_s,
+    }
+    rig = make_rig(config.with_overrides(settings_with(), settings))
+    (trip,) = Loop(rig).run(870).trips
+    assert "the delay cannot be measured" in trip
+    assert (" at 0.2 s: without simulation.hand.first_strike_s" in trip) is told
+
+
 @pytest.mark.parametrize(
     ("known", "law", "measures"),
     [
