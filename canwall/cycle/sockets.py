@@ -25,7 +25,7 @@ from canwall.bus.raw_socket import (
     wait_readable,
 )
 from canwall.compiled import Record, compiled
-from canwall.cycle.core import CORE, Want, proceed, take
+from canwall.cycle.core import CORE, Want, proceed, proceed_without, take
 from canwall.cycle.transport import CycleFrames
 from canwall.drive import Link
 
@@ -156,10 +156,13 @@ def _run(cores: NDArray[np.void], sockets: NDArray[np.void]) -> int:
     socket: Record = sockets[0]
     port = socket.port[0]
     asked_ns = now_ns(port)
+    # True once the drive has taken all that was sent: what it has answered waits in the socket.
+    served = socket.idled
     want = _FRAME if socket.idled else proceed(cores, asked_ns)
     socket.idled = False
     while True:
         if want == _SEND:
+            served = False
             out = core.out
             patience_ns = socket.send_patience_ns
             if send(port, socket.descriptor, out[0], out[1], out[2], patience_ns) != FRAME:
@@ -179,7 +182,10 @@ def _run(cores: NDArray[np.void], sockets: NDArray[np.void]) -> int:
                 return _ERRNO
             elif want == _DRAIN or now_ns(port) >= core.until_ns:
                 want = proceed(cores, now_ns(port))
+            elif served and not core.real_time:
+                want = proceed_without(cores, now_ns(port))
             elif socket.idle:
+                served = True
                 if not (
                     socket.idle_function and _call_idle(socket.idle_function, socket.idle_state)
                 ):
