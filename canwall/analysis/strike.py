@@ -258,14 +258,29 @@ def first_depth(y: Array) -> float:
 
 
 @compiled
+def _fastest_crossing(y: Array, inside: int, step: int, count: float) -> float:
+    """Return the fastest mean from a sample inside to one of the next SPAN outside, less a count.
+
+    In radians a sample; that quantisation makes a way longer shall not make it faster. step: 1 for
+    the samples after the one inside, −1 for those before it.
+    """
+    fastest = 0.0
+    for n in range(1, SPAN + 1):
+        outside = inside + step * n
+        if not 0 <= outside < len(y) or y[outside] < 0.0:
+            break
+        fastest = max(fastest, (y[outside] - y[inside] - count) / n)
+    return fastest
+
+
+@compiled
 def first_bounce(y: Array, period: float, count: float) -> tuple[float, float]:
     """Return the speed into the first contact and the restitution; NaN if there is none.
 
-    Speeds are means over SPAN samples. That of the approach is the fastest of those which end
-    within the last SPAN samples before the contact, since a wall may act ahead of its surface; that
-    on leaving is over the first samples outside, and negative of a handle that turns back in these;
-    of one that is inside again by then, it is that from the last sample inside to the farthest one,
-    less a count.
+    Both speeds are the fastest of means: of those over SPAN samples outside, and of those between
+    the samples next to the contact, less a count, since hand and friction change the speed within
+    SPAN samples. On approach all means count that end within the last SPAN samples before the
+    contact: a wall may act ahead of its surface.
     Where a wall has stopped the handle before its surface, it creeps in: below a count a sample its
     speed says nothing, and the restitution is the speed on leaving over a count a sample.
     """
@@ -274,23 +289,20 @@ def first_bounce(y: Array, period: float, count: float) -> tuple[float, float]:
         enter += 1
     if enter <= SPAN or enter >= len(y):
         return math.nan, math.nan
-    speed = math.inf
+    approach = _fastest_crossing(y, enter, -1, count)
     for j in range(max(enter - SPAN, SPAN), enter):
-        speed = min(speed, (y[j] - y[j - SPAN]) / (SPAN * period))
+        approach = max(approach, (y[j - SPAN] - y[j]) / SPAN)
     leave = enter
     while leave < len(y) and y[leave] < 0.0:
         leave += 1
-    if not speed < 0.0:
-        return speed, math.nan
+    if not approach > 0.0:
+        return -approach / period, math.nan
     back = leave
-    while back < len(y) and back <= leave + SPAN and y[back] >= 0.0:
+    while back < len(y) and back < leave + SPAN and y[back] >= 0.0:
         back += 1
-    if back > leave + SPAN:
-        out = (y[leave + SPAN] - y[leave]) / (SPAN * period)
-    elif back == len(y):
-        return speed, math.nan
-    else:
-        farthest = leave + np.argmax(y[leave:back])
-        # That quantisation makes a rise longer by up to a count shall not make it faster.
-        out = max(y[farthest] - y[leave - 1] - count, 0.0) / ((farthest - leave + 1) * period)
-    return speed, out / max(-speed, count / period)
+    if back == len(y):
+        return -approach / period, math.nan
+    out = _fastest_crossing(y, leave - 1, 1, count)
+    if y[back] >= 0.0:
+        out = max(out, (y[back] - y[leave]) / SPAN)
+    return -approach / period, out / max(approach, count)

@@ -25,7 +25,7 @@ def pressed() -> np.ndarray:
     fall = (IN - j - 0.5) * PERIOD_S
     leave = (j - OUT + 0.5) * 0.5 * PERIOD_S
     dip = np.interp(j, [IN, DEEP, REST], [fall[IN], -FIRST_DEPTH, -DEPTH])
-    return np.select([j < IN, j < REST, j < OUT], [fall, dip, -DEPTH], leave)
+    return np.select([j < IN, j < REST, j < OUT - 1], [fall, dip, -DEPTH], leave)
 
 
 def chattering(frequency_hz: float = FREQUENCY_HZ) -> np.ndarray:
