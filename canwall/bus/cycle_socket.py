@@ -92,9 +92,9 @@ class CycleSocket:
                 self.stamped = True
 
     def renew(self) -> bool:
-        """Look for the socket again after the peer has closed it; return whether there is one."""
+        """Look for the socket again after a failure; return whether there is one."""
         if self._own is not None:
-            return False
+            return True
         assert isinstance(self._bus, FrameSocket)
         descriptor = self._bus.frame_descriptor()
         if descriptor is None:

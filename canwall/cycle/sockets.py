@@ -39,6 +39,7 @@ _SEND_PATIENCE_S, _SEND_SHARE = 1.0, 0.2
 #: Results of `_run` besides a `Want`: the idle function has to be called in Python; the other side
 #: has closed; a call has failed, with `errno` in the port.
 _IDLE, _GONE, _ERRNO = 100, 101, 102
+_HAS_GONE = "the other side of the bus has gone"
 _SEND, _FRAME, _DRAIN, _SLEEP, _SPIN = map(
     int, (Want.SEND, Want.FRAME, Want.DRAIN, Want.SLEEP, Want.SPIN)
 )
@@ -90,6 +91,7 @@ class SocketTransport:
         patience_s = _SEND_SHARE * frames.period_s if frames.real_time else _SEND_PATIENCE_S
         self._socket["send_patience_ns"] = round(patience_s * 1e9)
         self._socket["poll_ns"] = POLL_NS
+        self._has_failed = False
 
     @property
     def poll_ns(self) -> int:
@@ -111,6 +113,8 @@ class SocketTransport:
 
     def run(self) -> Want:
         """Move frames until the core wants Python. Raises can.CanError if the bus fails."""
+        if self._has_failed:
+            self._find_again()
         link, socket = self._link, self._socket
         socket["idle"], socket["idled"] = link.idle is not None, False
         socket["idle_function"], socket["idle_state"] = link.compiled_idle or CFunction(0, 0)
@@ -118,13 +122,18 @@ class SocketTransport:
             idle: Callable[[], None] | None = link.idle
             assert idle is not None
             idle()
+        self._has_failed = result in (_GONE, _ERRNO)
         if result == _GONE:
-            if self._cycle_socket.renew():
-                self.descriptor = self._cycle_socket.descriptor
-            raise can.CanOperationError("the other side of the bus has gone")
+            raise can.CanOperationError(_HAS_GONE)
         if result == _ERRNO:
             raise bus_error(int(socket["port"]["errno"][0, 0]), link.bus)
         return Want(result)
+
+    def _find_again(self) -> None:
+        """Use the connection that the bus has now: the number of a closed one may be a file's."""
+        if not self._cycle_socket.renew():
+            raise can.CanOperationError(_HAS_GONE)
+        self.descriptor = self._cycle_socket.descriptor
 
     def finish_cycle(self) -> None:
         """Hand over frames that the bus received outside the socket of the cycle."""

@@ -1,16 +1,23 @@
-"""The descriptor of the cycle: the kernel's time stamps on what comes through it."""
+"""The descriptor of the cycle: the kernel's stamps on what comes through it, and its end."""
 
+import os
 import signal
 import socket
 import time
+from pathlib import Path
 
 import can
 import numpy as np
+import pytest
 from rig import RPDO1, TPDO1
 
 from canwall.bus import socket_pair
 from canwall.bus.cycle_socket import CycleSocket
 from canwall.bus.raw_socket import FAILED, FRAME, PORT, place_port, receive, send
+from canwall.cycle.core import CORE, begin
+from canwall.cycle.sockets import SocketTransport
+from canwall.cycle.transport import CycleFrames
+from canwall.drive import Link
 
 
 def test_kernel_stamps_of_a_borrowed_descriptor() -> None:
@@ -45,3 +52,25 @@ def test_signal_does_not_end_the_wait_for_room() -> None:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             signal.signal(signal.SIGALRM, handler)
         assert time.monotonic() - begin >= 0.2
+
+
+def test_number_of_a_connection_that_is_closed_is_not_used_again(tmp_path: Path) -> None:
+    """It may be that of another file by then, as of the record: no RPDO gets into it."""
+    channel = str(tmp_path / "bus")
+    hub = can.Bus(interface="unixcan", channel=channel)
+    with can.Bus(interface="unixcan", channel=channel) as bus:
+        core, frames = np.zeros(1, CORE), CycleFrames((TPDO1,), (RPDO1,), False, 0.001)
+        transport = SocketTransport(Link(bus), core, frames)
+        hub.shutdown()
+        begin(core, 1, 0)
+        with pytest.raises(can.CanOperationError):
+            transport.run()
+        bus.recv(0.0)  # it joins again, as the hub
+        with (tmp_path / "file").open("wb") as file:
+            os.dup2(file.fileno(), transport.descriptor)
+            begin(core, 1, 0)
+            with pytest.raises(can.CanOperationError, match="the other side of the bus has gone"):
+                transport.run()
+            os.close(transport.descriptor)
+            assert file.tell() == 0
+        transport.close()
