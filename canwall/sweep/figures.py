@@ -136,7 +136,10 @@ def _draw_panels(dataset: xr.Dataset, drawn: tuple[str, ...], draw: Draw) -> lis
             draw(axes, dataset.isel(dict(zip(others, point, strict=True))))
             title = panel_title(dataset, dict(zip(others, point, strict=True)))
             axes.set_title(textwrap.fill(title, _TITLE_LETTERS, break_on_hyphens=False))
-        parameters = textwrap.fill(shared_parameters(dataset), round(13 * width))
+        # Lines end between two parameters.
+        joined = shared_parameters(dataset).replace(" ", "\N{NO-BREAK SPACE}")
+        separated = joined.replace(",\N{NO-BREAK SPACE}", ", ")
+        parameters = textwrap.fill(separated, round(13 * width))
         figure.suptitle(parameters, fontsize=9, color="0.3", x=0.01, ha="left")
         handles, labels = _legend(figure)
         if handles:

@@ -236,7 +236,7 @@ def test_damping_of_k_limits_is_told(tmp_path: Path, drawn: dict[str, Figure]) -
         limits = sweep(make_plan(settings, given), tmp_path / f"{ratio}.nc")
         write_sweep_figures(limits, tmp_path / "k")
         figure = drawn["k-limit-over-rate"]
-        assert told in figure.get_suptitle().replace("\n", " ")
+        assert told in " ".join(figure.get_suptitle().split())
         assert len(line(figure, 0, f"spring {walls}, linear, exact")) == 2
 
 
