@@ -7,9 +7,10 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
+import main_job
 import pytest
 from commands import Record
-from rig import SIM_CONFIG, Loop, Rig, settings_with
+from rig import SIM_CONFIG, Loop, Rig
 from socketcan import (
     PATIENCE_S,
     Bench,
@@ -26,9 +27,6 @@ from canwall.run import run
 from canwall.simdrive import load_compiled_code
 
 EXCHANGES = ("native", "python-can")
-
-#: Of the main job: two strikes, one by each law. scripts/vcan-guest makes the same on its host.
-MAIN_JOB_S = 2.2
 
 _WHY_NOT = (
     "the kernel has no SocketCAN (PF_CAN); scripts/vcan-guest python -m pytest tests/vcan"
@@ -55,7 +53,7 @@ def loaded(tmp_path_factory: pytest.TempPathFactory) -> None:
     It takes an emulated processor seconds, which the first TPDO would come too late by.
     """
     if not _WHY_NOT:
-        rig = Rig(settings_with(), native=True)
+        rig = Rig(config.load(SIM_CONFIG), native=True)
         Loop(rig).run(300)
         rig.close()
         # Of a drive in a process of its own as well, which is ready once it has all of it.
@@ -104,14 +102,14 @@ def strikes(strikes_by: Callable[[str], Strikes], exchange: str) -> Strikes:
 def _strike(folder: Path, exchange: str) -> Strikes:
     """Two strikes; candump, a load from cangen, cansend, other nodes, a second master beside."""
     with closing(Bench(folder, exchange)) as bench:
-        drive = bench.drive()
+        configuration = bench.config(main_job.CHANGES)
+        drive = bench.drive(configuration)
         candump = folder / "candump.log"
         dump = bench.start("candump", "-L", "vcan0", output=candump)
         # As anything else on a bus: identifiers that are nobody's here, data at random.
         bench.start("cangen", "vcan0", "-g", "30", "-I", "7A0", "-L", "8", "-D", "r")
         bench.other_nodes()
-        main_job = bench.config({"duration_s = 4.2": f"duration_s = {MAIN_JOB_S}"})
-        run = bench.canwall("run", main_job, "--output", folder / "run")
+        run = bench.canwall("run", configuration, "--output", folder / "run")
         # Between its first SYNCs an emulated processor may pause for as long as a master listens.
         wait_for(lambda: candump.read_bytes().count(b" 080#") > 300 or not run.running)
         bench.start("cansend", "vcan0", "605#4018100100000000").wait()
@@ -128,13 +126,10 @@ def _strike(folder: Path, exchange: str) -> Strikes:
 
 @pytest.fixture(scope="session")
 def embedded(tmp_path_factory: pytest.TempPathFactory) -> Record:
-    """The main job with the drive on the bus inside the program.
-
-    The guest is given the record of its host, which comes to it ten times faster.
-    """
+    """The main job with the drive on the bus inside the program."""
     given = os.environ.get("CANWALL_EMBEDDED_RECORD")
     if given:
         return Record(Path(given))
     folder = tmp_path_factory.mktemp("embedded") / "run"
-    run(config.load(SIM_CONFIG, {"run.duration_s": MAIN_JOB_S}), folder)
+    main_job.run_embedded(folder)
     return Record(folder)

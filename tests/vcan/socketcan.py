@@ -259,7 +259,7 @@ class Bench:
 
     def other_nodes(self) -> None:
         """Other nodes, which answer to a SYNC now and then: an emulated processor is slow."""
-        self._stack.enter_context(OtherNodes(self.bus(), every=20))
+        self._stack.enter_context(OtherNodes(self.bus(), every=10))
 
     def bus(self) -> can.BusABC:
         """A socket of the test's own on the interface."""

@@ -7,6 +7,7 @@ from copy import copy
 from pathlib import Path
 
 import can
+import main_job
 from commands import Record, read_log
 from conftest import Strikes
 from rig import RPDO1, SDO_REQUEST, SYNC, TPDO1
@@ -51,7 +52,7 @@ def test_replayed_master_gets_the_recorded_answers(
     _write_log(log, [frame for frame in played if frame.arbitration_id in _OF_THE_MASTER])
     recorded = [bytes(f.data) for f in played if f.arbitration_id == TPDO1]
     with closing(Bench(tmp_path, "native")) as bench:
-        bench.drive()
+        bench.drive(bench.config(main_job.CHANGES))
         dump = bench.start("candump", "-L", "vcan0,185:7FF", output=tmp_path / "candump.log")
         player = bench.start("canplayer", "-I", log)
         assert player.wait(PATIENCE_S) == 0
