@@ -27,7 +27,7 @@ _OF_THE_MASTER = (0x000, SYNC, RPDO1, SDO_REQUEST)
 #: code before a SYNC.
 _SLOWER, _LONGEST_S = 2.0, 0.5
 #: Cycles that are played: the hand has struck, and presses.
-_CYCLES = 500
+_CYCLES = 350
 
 
 def _write_log(path: Path, frames: list[can.Message]) -> None:
