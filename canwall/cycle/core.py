@@ -231,7 +231,8 @@ def proceed(cores: NDArray[np.void], now_ns: int) -> int:
 def proceed_without(cores: NDArray[np.void], now_ns: int) -> int:
     """Continue without the TPDOs that are missing: the drives have done all that they were asked.
 
-    That is known in simulated time of drives that this process serves. Returns a `Want`.
+    That is known in simulated time of drives that this process serves, on its own SYNC: that of
+    another producer comes when it likes. Returns a `Want`.
     """
     core: Record = cores[0]
     core.looked_again = True

@@ -191,7 +191,7 @@ def _run(cores: NDArray[np.void], sockets: NDArray[np.void]) -> int:
                 return _ERRNO
             elif want == _DRAIN or now_ns(port) >= core.until_ns:
                 want = proceed(cores, now_ns(port))
-            elif served and not core.real_time:
+            elif served and not core.real_time and not core.external_sync:
                 want = proceed_without(cores, now_ns(port))
             elif socket.idle:
                 served = True
