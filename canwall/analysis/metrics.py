@@ -28,6 +28,8 @@ EVENTS_OF_CHATTER = 3
 EVENTS_RATIO = 1.25
 #: Shortest stretch over which a settled position is judged [s].
 SETTLED_S = 0.05
+#: Beginning and end of the time in which a wall comes to rest after its referent has [s].
+SETTLING_S = (0.02, 0.2)
 
 #: Relative rounding of a motion, the difference of two positions.
 _ROUNDING = 1e-9
@@ -289,6 +291,16 @@ def judged_part(start: int, stop: int) -> tuple[int, int]:
     """Return the part of a stretch in which the wall is at rest: its second half but the end."""
     length = stop - start
     return start + length // 2, start + length * 9 // 10
+
+
+@compiled
+def settling_part(rest: int, start: int, cycle_s: float) -> tuple[int, int]:
+    """Return the part of a stretch in which a wall comes to rest after its referent.
+
+    It ends before the part that is judged, which begins at `start`, and is empty where nothing is.
+    """
+    begin, end = SETTLING_S
+    return rest + round(begin / cycle_s), min(rest + round(end / cycle_s), start)
 
 
 @compiled

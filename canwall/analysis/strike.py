@@ -28,6 +28,7 @@ MEASURES = np.dtype(
         ("tolerance", "f8"),
         ("ripple", "f8"),
         ("referent_ripple", "f8"),
+        ("settling_ripple", "f8"),
         ("amplitude", "f8"),
         ("frequency", "f8"),
         ("energy_out", "f8"),
@@ -66,6 +67,7 @@ MEASURE_DESCRIPTIONS = {
     "tolerance": ("rad", "motion that quantisation explains"),
     "ripple": ("N", "felt ripple: force on the hand, r.m.s. in 20-500 Hz, at the handle"),
     "referent_ripple": ("N", "the same of the continuous referent"),
+    "settling_ripple": ("N", "felt ripple from 20 to 200 ms after the referent has come to rest"),
     "amplitude": ("rad", "half peak to peak of the chatter, 0: none"),
     "frequency": ("Hz", "frequency of the chatter, 0: none"),
     "energy_out": ("J", "most energy that the wall had put out at any time"),
@@ -139,6 +141,8 @@ def measure_strike(
     into.referent_motion = metrics.peak_to_peak(referent[start:stop])
     into.ripple = band_rms(band, felt[rest:], start - rest, stop - rest) / radius
     into.referent_ripple = band_rms(band, referent_felt[rest:], start - rest, stop - rest) / radius
+    begin, end = metrics.settling_part(rest, start, period)
+    into.settling_ripple = band_rms(band, felt[rest:], begin - rest, end - rest) / radius
     _integrate_energy(into, y, force)
     into.peak_torque = np.abs(torque).max() if len(torque) else 0.0
     into.energy_tolerance = count * into.peak_torque

@@ -126,6 +126,10 @@ def test_cap_is_what_is_in_force(
     assert fewest <= sum(int(number) for number, _ in failed) <= most
     least = [float(row[1]) for row in rows if "least" in row[0]]
     assert least == pytest.approx([cap / 4.2 for cap in law_tables.CAPS], rel=5e-3)
+    felt = np.array([float(row[1]) for row in rows if "comes to rest" in row[0]])
+    median, most_strikes = felt.reshape(len(law_tables.CAPS), 2).T
+    assert (median <= most_strikes).all()
+    assert (most_strikes > 0.1).all() or not estimator
 
 
 @pytest.mark.slow
