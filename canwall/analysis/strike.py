@@ -299,12 +299,10 @@ def first_bounce(y: Array, period: float, count: float) -> tuple[float, float]:
     leave = enter
     while leave < len(y) and y[leave] < 0.0:
         leave += 1
-    if not approach > 0.0:
-        return -approach / period, math.nan
     back = leave
     while back < len(y) and back < leave + SPAN and y[back] >= 0.0:
         back += 1
-    if back == len(y):
+    if approach == 0.0 or back == len(y):
         return -approach / period, math.nan
     out = _fastest_crossing(y, leave - 1, 1, count)
     if y[back] >= 0.0:
