@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 from rich import box
-from rich.markup import escape
 from rich.table import Table
 
 from canwall.cli.options import JsonOption, absolute_path, settings_from
@@ -152,7 +151,6 @@ def init(
         f"at most {written.limits.torque_nm:g} N·m; next: canwall doctor {output}",
         soft_wrap=True,
         highlight=False,
-        markup=False,
     )
     return 0
 
@@ -177,7 +175,7 @@ def config(
         table.add_column(no_wrap=True)
         table.add_column(overflow="fold")
         for each, path in known.items():
-            table.add_row(each, escape(config.title_of(path)))
+            table.add_row(each, config.title_of(path))
         console.print(table, highlight=False)
         return 0
     text = config.portable_text(config.named(name))
@@ -186,7 +184,7 @@ def config(
         return 0
     _refuse_to_overwrite(output, force)
     _write(output, text)
-    console.print(str(output), soft_wrap=True, highlight=False, markup=False)
+    console.print(str(output), soft_wrap=True, highlight=False)
     return 0
 
 
@@ -297,7 +295,7 @@ def _node_table(nodes: "list[BusNode]") -> Table:
         )
         table.add_row(
             str(node.node_id),
-            escape(node.name or "–"),
+            node.name or "–",
             node.profile,
             f"{vendor},\n{', '.join(others)}",
             node.nmt_state or "–",

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.markup import escape
 from rich.table import Table
 
 from canwall.cli.ending import FAILED, StoppedError, failed_if
@@ -53,7 +52,7 @@ def doctor(
     from canwall.drive import REQUIRED_OBJECTS
 
     def announce(step: str) -> None:
-        errors.print(f"doctor: {step}", markup=False)
+        errors.print(f"doctor: {step}")
 
     findings = Findings()
     try:
@@ -96,7 +95,7 @@ def dbc(
         output.write_text(text, encoding="cp1252", errors="replace", newline="")
     except OSError as error:
         raise ConfigError(f"{output}: cannot be written: {error.strerror}") from None
-    console.print(f"written: {output}", soft_wrap=True, highlight=False, markup=False)
+    console.print(f"written: {output}", soft_wrap=True, highlight=False)
     return 0
 
 
@@ -148,7 +147,7 @@ def latency(
         print_json(json_content(measured))
     else:
         for line in report_lines(measured):
-            console.print(line, soft_wrap=True, highlight=False, markup=False)
+            console.print(line, soft_wrap=True, highlight=False)
     if output is not None:
         for path in write_latency(measured, output):
             if not as_json:
@@ -157,7 +156,7 @@ def latency(
             say(f"no picture: {how_to_install('plot')}")
     if as_json:
         return failed
-    console.print(measured.shortest_cycle.text, soft_wrap=True, highlight=False, markup=False)
+    console.print(measured.shortest_cycle.text, soft_wrap=True, highlight=False)
     return failed
 
 
@@ -168,7 +167,6 @@ def _print_findings(findings: "Findings") -> None:
             trouble = "" if line.well else "TROUBLE: "
             console.print(
                 f"{line.section}: {line.what}: {trouble}{line.found}{_to_do(line)}",
-                markup=False,
                 highlight=False,
                 soft_wrap=True,
             )
@@ -181,7 +179,7 @@ def _print_findings(findings: "Findings") -> None:
         style = "" if line.well else "bold red"
         heading = "" if line.section == section else line.section
         cells = (heading, line.what, line.found, line.do)
-        table.add_row(*(escape(text) for text in cells), style=style)
+        table.add_row(*cells, style=style)
         section = line.section
     console.print(table)
 
@@ -194,7 +192,7 @@ def _print_verdict(findings: "Findings", config_file: Path) -> None:
         for number, line in enumerate(findings.troubles, start=1):
             lines.append(f"{number:2}. {line.section}, {line.what}: {line.found}{_to_do(line)}")
     for text in lines:
-        console.print(text, markup=False, highlight=False, soft_wrap=True)
+        console.print(text, highlight=False, soft_wrap=True)
 
 
 def _to_do(line: "Finding") -> str:

@@ -82,9 +82,9 @@ def identify(
         else:
             if told:
                 for line in report_lines(found, settings, inertia):
-                    console.print(line, soft_wrap=True, highlight=False, markup=False)
+                    console.print(line, soft_wrap=True, highlight=False)
                 if fragment := toml_fragment(found):
-                    console.print(f"\n{fragment}", soft_wrap=True, highlight=False, markup=False)
+                    console.print(f"\n{fragment}", soft_wrap=True, highlight=False)
             console.print(f"record: {result.folder.path}", soft_wrap=True, highlight=False)
         if told and not is_installed("plot"):
             say(f"no picture: {how_to_install('plot')}")

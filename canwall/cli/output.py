@@ -18,6 +18,10 @@ class _LastingConsole(Console):
 
     has_lost = False
 
+    def __init__(self, **options: Any) -> None:
+        # What is printed is text: [b] and :b: are parts of names.
+        super().__init__(markup=False, emoji=False, **options)
+
     def print(self, *objects: Any, **options: Any) -> None:
         try:
             super().print(*objects, **options)
@@ -41,7 +45,7 @@ errors = _LastingConsole(stderr=True, soft_wrap=True, highlight=False)
 
 def say(text: str) -> None:
     """Print an error, a warning or a note as a line on standard error."""
-    errors.print(f"canwall: {text}", markup=False)
+    errors.print(f"canwall: {text}")
 
 
 def print_json(content: Any) -> None:
@@ -51,7 +55,7 @@ def print_json(content: Any) -> None:
 
 def print_text(text: str, end: str = "\n") -> None:
     """Print a text on standard output as it is."""
-    console.print(text, end=end, soft_wrap=True, highlight=False, markup=False, emoji=False)
+    console.print(text, end=end, soft_wrap=True, highlight=False)
 
 
 class ProgressDisplay:

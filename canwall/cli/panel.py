@@ -68,7 +68,6 @@ def panel(
             f"{opened.server.url}?token={opened.server.access.token}",
             soft_wrap=True,
             highlight=False,
-            markup=False,
         )
         if not with_run:
             say("Ctrl-C ends the panel; a run goes on")

@@ -12,7 +12,6 @@ from typing import IO, TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich import box
-from rich.markup import escape
 from rich.table import Table
 
 from canwall.cli.completion import complete_config, complete_law
@@ -141,7 +140,7 @@ def _tell(results: "Sequence[RunResult]", as_json: bool) -> int:
             console.print(_strike_table(strikes) if strikes else "No strike: nothing has pressed.")
             console.print(f"record: {result.folder.path}", soft_wrap=True, highlight=False)
             for advice in result.summary["timing"]["advice"] if result is results[0] else ():
-                console.print(advice, soft_wrap=True, highlight=False, markup=False)
+                console.print(advice, soft_wrap=True, highlight=False)
         for remark in result.remarks:
             say(remark)
         code |= failed_if((*result.not_restored, *result.notes))
@@ -213,7 +212,7 @@ def drive(
     def tell(line: str, event: str, **more: Any) -> None:
         if as_json:
             line = json.dumps({"event": event} | more, ensure_ascii=False)
-        console.print(line, soft_wrap=True, highlight=False, markup=False, emoji=False)
+        console.print(line, soft_wrap=True, highlight=False)
 
     def report(line: str) -> None:
         tell(line, "report", text=line)
@@ -267,13 +266,13 @@ def _strike_table(strikes: list[dict[str, Any]]) -> Table:
     headings = [
         "#",
         "law",
-        "K\nasked" if finds else "K\n\\[N·m/rad]",
-        *(["in\nforce", "mass\n\\[g·m²]"] if finds else []),
+        "K\nasked" if finds else "K\n[N·m/rad]",
+        *(["in\nforce", "mass\n[g·m²]"] if finds else []),
         "con-\ntacts" if finds else "contacts",
-        "depth\n\\[mrad]" if finds else "deepest\n\\[mrad]",
+        "depth\n[mrad]" if finds else "deepest\n[mrad]",
         "first\n÷ ref.",
-        "energy\n\\[mJ]" if finds else "energy\nout \\[mJ]",
-        "ripple\n\\[N]",
+        "energy\n[mJ]" if finds else "energy\nout [mJ]",
+        "ripple\n[N]",
         "chatter",
     ]
     for heading in headings:
@@ -291,7 +290,7 @@ def _strike_table(strikes: list[dict[str, Any]]) -> Table:
             chatter = f"yes, {frequency:.0f} Hz" if frequency else "yes"
         table.add_row(
             str(count),
-            escape(short_law(strike["law"])),
+            short_law(strike["law"]),
             f"{strike['stiffness']:g}",
             *(_found(strike) if finds else ()),
             str(strike["contacts"]),

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 import xarray as xr
-from rich.markup import escape
 from rich.table import Table
 
 from canwall.sweep.axes import DAMPING, STIFFNESS, STRIKES
@@ -23,12 +22,12 @@ def sweep_table(dataset: xr.Dataset) -> Table:
         if number == 0:
             for name in row:
                 table.add_column(
-                    escape(name),
+                    name,
                     justify="left" if name == "law" else "right",
                     no_wrap=name != "law",
                     overflow="fold",
                 )
-        table.add_row(*map(escape, row.values()))
+        table.add_row(*row.values())
     return table
 
 

@@ -18,7 +18,7 @@ from rich.table import Table
 
 from canwall import cli, config
 from canwall.cli.completion import law_names
-from canwall.cli.output import _LastingConsole, print_json
+from canwall.cli.output import _LastingConsole, print_json, print_text, say
 from canwall.cli.run import _strike_table
 from canwall.errors import did_you_mean
 from canwall.sweep import read_sweep
@@ -213,6 +213,19 @@ def test_no_color(monkeypatch: pytest.MonkeyPatch, no_color: bool) -> None:
     written = io.StringIO()
     _LastingConsole(file=written, force_terminal=True).print(table)
     assert ("31m" in written.getvalue()) is not no_color
+
+
+def test_names_are_printed_as_they_are(capfd: pytest.CaptureFixture[str]) -> None:
+    name = "[b]:x:"
+    say(f"law {name}: no such file")
+    print_text(name)
+    assert capfd.readouterr() == (f"{name}\n", f"canwall: law {name}: no such file\n")
+    written = io.StringIO()
+    console = _LastingConsole(file=written, width=80)
+    console.print(f"record: runs/{name}")
+    console.print(_strike_table([strike(name)]))
+    assert written.getvalue().count(name) == 2
+    assert "[mrad]" in written.getvalue()
 
 
 def test_json_has_what_json_allows(capfd: pytest.CaptureFixture[str]) -> None:

@@ -155,7 +155,7 @@ def test_summary_has_what_is_in_force(unknown: tuple[pa.Table, dict[str, Any]]) 
 def test_table_of_strikes_fits_a_terminal(unknown: tuple[pa.Table, dict[str, Any]]) -> None:
     (judgement,) = unknown[1]["strikes"]
     strikes = [judgement | {"law": "half_sample", "chatter": True, "chatter_frequency_hz": 262.1}]
-    console = Console(width=80, color_system=None)
+    console = Console(width=80, color_system=None, markup=False)
     with console.capture() as capture:
         console.print(_strike_table(strikes))
     shown = capture.get()
@@ -247,7 +247,7 @@ def test_chatter_without_a_frequency_is_said_without() -> None:
     table, settings, units, _ = strike("finger", 430.0)
     (judgement,) = judged(table, settings, units)["strikes"]
     judgement |= {"chatter": True, "chatter_frequency_hz": 0.0}
-    console = Console(width=80, color_system=None)
+    console = Console(width=80, color_system=None, markup=False)
     with console.capture() as capture:
         console.print(_strike_table([judgement]))
     assert "Hz" not in capture.get()
