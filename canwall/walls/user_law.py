@@ -12,6 +12,7 @@ import keyword
 import math
 import os
 import re
+import sys
 import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -97,6 +98,9 @@ def _declared_options(law: str, options: object) -> Mapping[str, float]:
         and all(isinstance(n, str) and isinstance(v, int | float) for n, v in options.items())
     ):
         raise UnknownLawError(f"{law}: OPTIONS has to be a dictionary of names and numbers")
+    for name, value in options.items():
+        if not abs(value) <= sys.float_info.max:
+            raise UnknownLawError(f"{law}: OPTIONS: {name} has to be a finite number")
     for name in options:
         if not name.isidentifier() or keyword.iskeyword(name):
             raise UnknownLawError(

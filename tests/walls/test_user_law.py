@@ -208,6 +208,10 @@ def test_helpers_constants_memory_and_plain_integers(write: Write) -> None:
         ("import math\nmath.nowhere\n", "AttributeError: module 'math' has no attribute 'nowhere'"),
         ("OPTIONS = ['a']\ndef mine(wall):\n    return 0.0\n", "OPTIONS "),
         ("OPTIONS = {'a': 'b'}\ndef mine(wall):\n    return 0.0\n", "OPTIONS "),
+        *(
+            (f"OPTIONS = {{'a': {value}}}\ndef mine(wall):\n    return 0.0\n", "OPTIONS: a has to")
+            for value in ("float('nan')", "-1e999", "10**400")
+        ),
         (
             "OPTIONS = {'a-b': 1}\ndef mine(wall):\n    return 0.0\n",
             "OPTIONS: 'a-b' cannot be read",
