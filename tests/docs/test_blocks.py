@@ -13,6 +13,7 @@ The folder looks like a checkout. What differs from what a reader would see:
 """
 
 import contextlib
+import csv
 import re
 import shlex
 import shutil
@@ -80,6 +81,20 @@ def test_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
             for other in sorted(set(page.parent.glob("*.md")) - {page}):
                 player.play(block for block in blocks(other) if block.caption)
         player.play(blocks(page))
+
+
+@pytest.mark.slow
+def test_encoder_of_the_tutorial_sticks_as_the_handle_enters_the_wall(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    parts = [b for b in blocks(DOCS / "tutorial.md") if "stuck" in (b.caption or b.text)]
+    with contextlib.closing(Player(tmp_path)) as player:
+        player.play(iter(parts))
+    with (tmp_path / "runs/stuck/trip.csv").open(encoding="utf-8") as file:
+        depths = [-float(row["y"]) for row in csv.DictReader(file)]
+    assert len(depths) == 200
+    assert depths[-6] == depths[-1] > 0.0 > depths[-8]
 
 
 def test_what_is_not_played_is_known() -> None:
