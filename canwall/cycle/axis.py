@@ -145,8 +145,8 @@ class WallAxis:
         silent_s = self.controls.silent_s(self.beat_since_ns)
         if silent_s > self.beat_timeout_s:
             self.reported = self.reported or (
-                f"no beat from the panel for {silent_s:.2g} s, {self.beat_timeout_s:g} s is the "
-                f"most: the wall was ramped down"
+                f"no beat from panel or script for {silent_s:.2g} s, {self.beat_timeout_s:g} s is "
+                f"the most: the wall was ramped down"
             )
             withdraw_wall(self.cycle, round(self.settings.run.blend_s / self.settings.bus.cycle_s))
 

@@ -245,7 +245,7 @@ class LiveRun:
 
         Raises:
             ConfigError: If it is wrong, or the run refuses it; with the reason.
-            RunFailedError: If the run does not take it in time.
+            RunFailedError: If the run has ended, or does not take it in time.
         """
         request = parse_request(values) if isinstance(values, dict) else values
         text = _with_absolute_laws(request).model_dump_json(exclude_none=True)
@@ -253,7 +253,9 @@ class LiveRun:
             with self._posting:
                 return self._mailbox.post(text, timeout_s)
         except TimeoutError:
-            raise RunFailedError(f"{self.folder.path}: the run does not take the change") from None
+            ended = self._status.read() is not None and self.status().ended
+            why = "has ended" if ended else "does not take the change"
+            raise RunFailedError(f"{self.folder.path}: the run {why}") from None
 
     def stop(self) -> None:
         """Have the torque zero in the next RPDO, and the run end; no process has to wake up."""
