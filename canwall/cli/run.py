@@ -294,7 +294,7 @@ def _strike_table(strikes: list[dict[str, Any]]) -> Table:
             f"{strike['stiffness']:g}",
             *(_found(strike) if finds else ()),
             str(strike["contacts"]),
-            f"{strike['peak_penetration_rad'] * 1e3:.2f}",
+            f"{strike['peak_penetration_rad'] * 1e3:z.2f}",
             _depth_ratio(strike),
             f"{strike['energy_out_j'] * 1e3:z.2f}",
             "–" if strike["felt_ripple_n"] is None else f"{strike['felt_ripple_n']:.2f}",

@@ -82,7 +82,9 @@ def load(path: Path, overrides: Mapping[str, Any] | None = None) -> Settings:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; give the path of a configuration") from None
-    except (OSError, ValueError) as error:  # ValueError: for a NUL, and for what is no UTF-8
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError as error:  # for a NUL, and for what is no UTF-8
         raise ConfigError(f"{path}: cannot be read: {error}") from None
     return parse(text, path, overrides)
 

@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator
 
 import can
+from can.interfaces.virtual import VirtualBus
 from canopen.emcy import EmcyError
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
@@ -238,9 +239,12 @@ class DriveNode:
         if self.node_id in others:
             return f"{silent}, but is on the bus: raise drive.sdo_timeout_s"
         if not others:
+            hint = "`canwall drive CONFIG` simulates one"
+            if isinstance(self.link.bus, VirtualBus):
+                hint = 'bus.interface = "virtual" ends at this process'
             return (
                 f"{silent}, nor does any other; is the drive on, on this bus, at this bit rate, "
-                "and is drive.node_id right? `canwall drive CONFIG` simulates one"
+                f"and is drive.node_id right? {hint}"
             )
         listed = ", ".join(str(node_id) for node_id in others)
         do = f"node {listed} does" if len(others) == 1 else f"nodes {listed} do"

@@ -182,7 +182,7 @@ def nothing_but_boot_up(listener: VirtualBus) -> bool:
     ("arguments", "line"),
     [
         (["none.toml"], "none.toml: no such file"),
-        (["."], "cannot be read"),
+        (["."], "cannot be read: Is a directory"),
         (["bad.toml"], "bad.toml: not valid TOML"),
         (["--law", "none"], "wall.law: unknown law 'none'; known are standard"),
         (["--law", "none.py:none"], "none.py"),

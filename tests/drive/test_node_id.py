@@ -29,11 +29,15 @@ def test_another_node_answers(rig: Rig) -> None:
         node.wait_until_present(0.0)
 
 
-def test_nobody_answers(rig: Rig) -> None:
+@pytest.mark.parametrize(
+    ("native", "hint"),
+    [(False, 'bus.interface = "virtual" ends at this process'), (True, "`canwall drive CONFIG`")],
+)
+def test_nobody_answers(make_rig: RigFactory, native: bool, hint: str) -> None:
+    rig = make_rig(settings_with(QUICK), native=native)
     rig.link.idle = lambda: None
     with pytest.raises(
-        DriveError,
-        match=r"does not answer within 0\.05 s, nor does any other; is .*`canwall drive CONFIG`",
+        DriveError, match=r"does not answer within 0\.05 s, nor does any other; is .*" + hint
     ):
         rig.set_up()
 
