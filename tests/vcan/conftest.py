@@ -1,6 +1,7 @@
 """A bench on vcan0 for each test, and the runs that several of them look at."""
 
 import functools
+import multiprocessing
 import os
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -10,7 +11,7 @@ from pathlib import Path
 import main_job
 import pytest
 from commands import Record
-from rig import SIM_CONFIG, Loop, Rig
+from rig import SIM_CONFIG
 from socketcan import (
     PATIENCE_S,
     Bench,
@@ -53,9 +54,6 @@ def loaded(tmp_path_factory: pytest.TempPathFactory) -> None:
     It takes an emulated processor seconds, which the first TPDO would come too late by.
     """
     if not _WHY_NOT:
-        rig = Rig(config.load(SIM_CONFIG), native=True)
-        Loop(rig).run(300)
-        rig.close()
         # Of a drive in a process of its own as well, which is ready once it has all of it.
         for real_time in (False, True):
             load_compiled_code(real_time)
@@ -109,12 +107,14 @@ def _strike(folder: Path, exchange: str) -> Strikes:
         # As anything else on a bus: identifiers that are nobody's here, data at random.
         bench.start("cangen", "vcan0", "-g", "30", "-I", "7A0", "-L", "8", "-D", "r")
         bench.other_nodes()
-        run = bench.canwall("run", configuration, "--output", folder / "run")
-        # Between its first SYNCs an emulated processor may pause for as long as a master listens.
-        wait_for(lambda: candump.read_bytes().count(b" 080#") > 300 or not run.running)
-        bench.start("cansend", "vcan0", "605#4018100100000000").wait()
+        begin = multiprocessing.Event()
         with long_ears():
-            second = bench.canwall("run", bench.config(), "--output", folder / "second")
+            words = "run", bench.config(), "--output", folder / "second"
+            second = bench.canwall(*words, begin=begin)
+        run = bench.canwall("run", configuration, "--output", folder / "run")
+        wait_for(lambda: b" 080#" in candump.read_bytes() or not run.running)
+        begin.set()
+        bench.start("cansend", "vcan0", "605#4018100100000000").wait()
         assert second.wait() == 1, second.errors
         assert run.wait() == 0, run.errors
         assert run.errors == []
@@ -131,5 +131,6 @@ def embedded(tmp_path_factory: pytest.TempPathFactory) -> Record:
     if given:
         return Record(Path(given))
     folder = tmp_path_factory.mktemp("embedded") / "run"
-    main_job.run_embedded(folder)
+    with light():
+        main_job.run_embedded(folder)
     return Record(folder)

@@ -12,11 +12,20 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from multiprocessing.synchronize import Event
 from pathlib import Path
 
 import can
+import numpy as np
 import pytest
-from commands import GUARD_SAID, ON_A_BUSY_MACHINE, SOFT_WALL, config_file, torque_is_on
+from commands import (
+    GUARD_SAID,
+    ON_A_BUSY_MACHINE,
+    SOFT_WALL,
+    Record,
+    config_file,
+    torque_is_on,
+)
 from other_nodes import OtherNodes
 
 import canwall.cycle.way_out
@@ -82,6 +91,21 @@ def first_difference(one: Sequence[object], other: Sequence[object]) -> tuple[ob
     return None if len(one) == len(other) else (len(one), len(other))
 
 
+def assert_same_run(one: Record, other: Record, cycles: int | None = None) -> None:
+    """Compare the (first) cycles of two runs, one of which may be another processor's.
+
+    They are equal bit by bit on the bus; what is computed beside, but for rounding.
+    """
+    assert first_difference(one.cycles[:cycles], other.cycles[:cycles]) is None
+    assert one.signals.schema.equals(other.signals.schema)
+    for name in set(one.signals.column_names) - {"sync_interval_s", "latency_s"}:
+        left, right = (record.column(name)[:cycles] for record in (one, other))
+        if left.dtype.kind == "f":
+            np.testing.assert_allclose(left, right, rtol=1e-9, atol=1e-9, err_msg=name)
+        else:
+            assert np.array_equal(left, right), name
+
+
 @contextlib.contextmanager
 def _fork_is_safe() -> Iterator[None]:
     """Python 3.12 and newer warn of forking where libraries have threads. Theirs are idle."""
@@ -94,15 +118,15 @@ class Canwall:
     """`canwall ARGUMENTS` in a process of its own.
 
     It is forked from this one, which has loaded already what takes an emulated processor twenty
-    seconds to load.
+    seconds to load. With an event it waits for that.
     """
 
-    def __init__(self, folder: Path, *arguments: object) -> None:
+    def __init__(self, folder: Path, *arguments: object, begin: Event | None = None) -> None:
         folder.mkdir()
         self._out, self._err = folder / "out.txt", folder / "err.txt"
         words = [str(word) for word in arguments]
         fork = multiprocessing.get_context("fork")
-        self._process = fork.Process(target=_main, args=(words, self._out, self._err))
+        self._process = fork.Process(target=_main, args=(words, self._out, self._err, begin))
         with _fork_is_safe():
             self._process.start()
 
@@ -141,7 +165,9 @@ class Canwall:
         self._process.join()
 
 
-def _main(words: list[str], out: Path, err: Path) -> None:
+def _main(words: list[str], out: Path, err: Path, begin: Event | None) -> None:
+    if begin is not None:
+        begin.wait()
     for descriptor, path in ((1, out), (2, err)):
         file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         os.dup2(file, descriptor)
@@ -230,10 +256,10 @@ class Bench:
         with_exchange = {"[drive]\n": f'exchange = "{self.exchange}"\n[drive]\n', **(changes or {})}
         return config_file(self.folder / f"{self._started}.toml", with_exchange, VCAN_CONFIG)
 
-    def canwall(self, *arguments: object) -> Canwall:
+    def canwall(self, *arguments: object, begin: Event | None = None) -> Canwall:
         self._started += 1
         folder = self.folder / f"canwall{self._started}"
-        program = Canwall(folder, *arguments)
+        program = Canwall(folder, *arguments, begin=begin)
         self._stack.callback(program.kill)
         return program
 

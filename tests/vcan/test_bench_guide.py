@@ -1,46 +1,21 @@
-"""What the bench guide says of interfaces and error frames, on interfaces."""
+"""Error frames, as the bench guide shows them."""
 
 import itertools
-import json
 import os
 import re
-import subprocess
 from pathlib import Path
 
-import pytest
 from pages import DOCS, blocks
-from socketcan import Bench, ip, wait_for
-from test_controllers import CONTROLLERS
+from socketcan import Bench, wait_for
 
-GUIDE = DOCS / "bench"
+GUIDE = DOCS / "bench" / "wiring.md"
 #: An error frame as candump -e shows it, and the lines that explain it.
 _SHOWN = re.compile(r"^can0  (\w{8})   \[8\]  (.{23})   ERRORFRAME\n((?:\t.*\n)+)", re.MULTILINE)
 
 
 def _shown() -> list[tuple[str, ...]]:
-    text = (GUIDE / "wiring.md").read_text(encoding="utf-8")
+    text = GUIDE.read_text(encoding="utf-8")
     return [match.groups() for match in _SHOWN.finditer(text)]
-
-
-@pytest.mark.skipif(not CONTROLLERS, reason="emulated controllers: scripts/vcan-guest has them")
-def test_adapter_is_brought_up_as_the_guide_says() -> None:
-    channel = CONTROLLERS[0]
-    first = next(block for block in blocks(GUIDE / "adapter.md") if block.remark == "root")
-    try:
-        for line in first.text.splitlines():
-            done = subprocess.run(
-                line.replace("can0", channel).split(), capture_output=True, text=True, check=False
-            )
-            assert (done.returncode, done.stderr) == (0, ""), line
-        shown = subprocess.run(
-            ["ip", "-json", "-details", "link", "show", channel], capture_output=True, check=True
-        )
-        (link,) = json.loads(shown.stdout)
-        can = link["linkinfo"]["info_data"]
-        assert (can["bittiming"]["bitrate"], can["restart_ms"]) == (1_000_000, 100)
-        assert (link["txqlen"], "UP" in link["flags"]) == (128, True)
-    finally:
-        ip("link", "set", channel, "down")
 
 
 def test_candump_shows_errors_as_the_guide_does(tmp_path: Path) -> None:
@@ -48,7 +23,7 @@ def test_candump_shows_errors_as_the_guide_does(tmp_path: Path) -> None:
     assert len(frames) == 5
     bench = Bench(tmp_path, "native")
     dump = tmp_path / "candump.txt"
-    command = next(block for block in blocks(GUIDE / "wiring.md") if "candump" in block.text).text
+    command = next(block for block in blocks(GUIDE) if "candump" in block.text).text
     bench.start("stdbuf", "-oL", *command.replace("can0", "vcan0").split(), output=dump)
     try:
         # candump may need a moment until it listens.
