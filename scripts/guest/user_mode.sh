@@ -1,6 +1,8 @@
 # A guest that computes as fast as its host: user-mode Linux, a kernel that is a program. Sourced by
 # scripts/vcan-guest.
 
+#: Its memory [MiB].
+memory=2048
 #: Mappings that a process of the host may have; one of the guest has one for almost every page.
 mappings=1048576
 
@@ -34,10 +36,13 @@ boot_user_mode() {
   } >"$folder/init"
   chmod +x "$folder/init"
   : >"$folder/status"
+  # The memory is a file, in /dev/shm if that has room for it.
+  room=$(df --block-size=1M --output=avail /dev/shm 2>/dev/null | tail -n 1)
+  [ "${room:-0}" -gt "$memory" ] && file_of_memory=/dev/shm || file_of_memory=$folder
   # What COMMAND says is on its second terminal, what the kernel says on its first.
-  LD_PRELOAD=$cache/user_mode/xstate.so timeout --foreground "$seconds" \
-    "$cache/user_mode/usr/bin/linux.uml" mem=2048M root=/dev/root rootfstype=hostfs rootflags=/ ro \
-    quiet init="$folder/init" uml_dir="$folder" con=null con0=null,fd:1 con1=null,fd:3 \
+  TMPDIR=$file_of_memory LD_PRELOAD=$cache/user_mode/xstate.so timeout --foreground "$seconds" \
+    "$cache/user_mode/usr/bin/linux.uml" "mem=${memory}M" root=/dev/root rootfstype=hostfs \
+    rootflags=/ ro quiet init="$folder/init" uml_dir="$folder" con=null con0=null,fd:1 con1=null,fd:3 \
     3>&1 >"$folder/console" 2>&1 </dev/null &
   until_it_ends
 }

@@ -1,7 +1,6 @@
 """A bench on vcan0 for each test, and the runs that several of them look at."""
 
 import functools
-import multiprocessing
 import os
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -105,15 +104,12 @@ def _strike(folder: Path, exchange: str) -> Strikes:
         candump = folder / "candump.log"
         dump = bench.start("candump", "-L", "vcan0", output=candump)
         # As anything else on a bus: identifiers that are nobody's here, data at random.
-        bench.start("cangen", "vcan0", "-g", "30", "-I", "7A0", "-L", "8", "-D", "r")
+        bench.start("cangen", "vcan0", "-g", "10", "-I", "7A0", "-L", "8", "-D", "r")
         bench.other_nodes()
-        begin = multiprocessing.Event()
-        with long_ears():
-            words = "run", bench.config(), "--output", folder / "second"
-            second = bench.canwall(*words, begin=begin)
         run = bench.canwall("run", configuration, "--output", folder / "run")
+        with long_ears():
+            second = bench.canwall("run", bench.config(), "--output", folder / "second")
         wait_for(lambda: b" 080#" in candump.read_bytes() or not run.running)
-        begin.set()
         bench.start("cansend", "vcan0", "605#4018100100000000").wait()
         assert second.wait() == 1, second.errors
         assert run.wait() == 0, run.errors

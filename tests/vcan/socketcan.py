@@ -12,7 +12,6 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from multiprocessing.synchronize import Event
 from pathlib import Path
 
 import can
@@ -118,15 +117,15 @@ class Canwall:
     """`canwall ARGUMENTS` in a process of its own.
 
     It is forked from this one, which has loaded already what takes an emulated processor twenty
-    seconds to load. With an event it waits for that.
+    seconds to load.
     """
 
-    def __init__(self, folder: Path, *arguments: object, begin: Event | None = None) -> None:
+    def __init__(self, folder: Path, *arguments: object) -> None:
         folder.mkdir()
         self._out, self._err = folder / "out.txt", folder / "err.txt"
         words = [str(word) for word in arguments]
         fork = multiprocessing.get_context("fork")
-        self._process = fork.Process(target=_main, args=(words, self._out, self._err, begin))
+        self._process = fork.Process(target=_main, args=(words, self._out, self._err))
         with _fork_is_safe():
             self._process.start()
 
@@ -165,9 +164,7 @@ class Canwall:
         self._process.join()
 
 
-def _main(words: list[str], out: Path, err: Path, begin: Event | None) -> None:
-    if begin is not None:
-        begin.wait()
+def _main(words: list[str], out: Path, err: Path) -> None:
     for descriptor, path in ((1, out), (2, err)):
         file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         os.dup2(file, descriptor)
@@ -195,9 +192,9 @@ def light() -> Iterator[None]:
 
 @contextlib.contextmanager
 def long_ears() -> Iterator[None]:
-    """Processes that begin meanwhile listen for another master for longer than a pause lasts."""
+    """Processes that begin meanwhile listen for another master until there is one."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(canwall.drive.other_masters, "_LISTEN_S", 20.0)
+        patch.setattr(canwall.drive.other_masters, "_LISTEN_S", PATIENCE_S)
         yield
 
 
@@ -256,10 +253,10 @@ class Bench:
         with_exchange = {"[drive]\n": f'exchange = "{self.exchange}"\n[drive]\n', **(changes or {})}
         return config_file(self.folder / f"{self._started}.toml", with_exchange, VCAN_CONFIG)
 
-    def canwall(self, *arguments: object, begin: Event | None = None) -> Canwall:
+    def canwall(self, *arguments: object) -> Canwall:
         self._started += 1
         folder = self.folder / f"canwall{self._started}"
-        program = Canwall(folder, *arguments, begin=begin)
+        program = Canwall(folder, *arguments)
         self._stack.callback(program.kill)
         return program
 
