@@ -46,11 +46,11 @@ export NUMBA_CPU_NAME=generic MPLCONFIGDIR="$root/.cache/guest/matplotlib"
 export CANWALL_EMBEDDED_RECORD="$root/.cache/guest/embedded" CANWALL_CONTROLLERS="can0 can1"
 '
 
-# KVM where it works: where /dev/kvm exists, a guest under it may still hang.
+# KVM where it works: where /dev/kvm exists, it may have no processor for it, or hang.
 accelerator() {
   accelerator=kvm
   mkdir "$work/proof"
-  if [ -w /dev/kvm ] && boot_emulated "$work/proof" "$proof" true >/dev/null 2>&1 &&
+  if [ -w /dev/kvm ] && grep -qw 'vmx\|svm' /proc/cpuinfo && boot_emulated "$work/proof" "$proof" true >/dev/null 2>&1 &&
     [ "$(cat "$work/proof/status")" = 0 ]; then
     echo kvm
   else
