@@ -117,7 +117,8 @@ def parse(text: str, path: Path, overrides: Mapping[str, Any] | None = None) -> 
 def check_values(raw: Mapping[str, Any]) -> None:
     """Raise ConfigError for what no key takes and what few functions expect.
 
-    These are NUL characters, integers of more than 64 bits, and tables deep in each other.
+    These are NUL characters, halves of surrogate pairs, which JSON can have, integers of more than
+    64 bits, and tables deep in each other.
     """
     waiting: list[tuple[tuple[str, ...], Any]] = [((), raw)]
     while waiting:
@@ -125,8 +126,11 @@ def check_values(raw: Mapping[str, Any]) -> None:
         where = ".".join(keys)
         if len(keys) > _DEEPEST:
             raise ConfigError(f"{where}: {_TOO_DEEP}")
-        if any("\0" in text for text in (where, value) if isinstance(text, str)):
+        texts = [text for text in (where, value) if isinstance(text, str)]
+        if any("\0" in text for text in texts):
             raise ConfigError(f"{where}: has a NUL character; take it out")
+        if any("\ud800" <= char <= "\udfff" for text in texts for char in text):
+            raise ConfigError(f"{where}: has half of a surrogate pair; take it out")
         if isinstance(value, int) and not -(2**63) <= value < 2**63:
             raise ConfigError(f"{where}: an integer of more than 64 bits; give a smaller one")
         if isinstance(value, dict):

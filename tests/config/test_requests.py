@@ -58,6 +58,7 @@ def test_request(values: dict[str, Any], kind: type) -> None:
         ),
         ({"do": "take_turns", "walls": [{"at_s": 1.0}]}, "walls.0.at_s: unknown key"),
         ({"do": "mark", "text": ""}, "text: has to have 1 to 200 characters, not 0"),
+        ({"do": "mark", "text": "a\ud83d"}, "text: has half of a surrogate pair"),
         ({"do": "mark", "text": "x" * 201}, "text: has to have 1 to 200 characters, not 201"),
         ({"do": "mark", "text": "\0"}, "text: has a NUL character"),
         ({"do": "watch_beat", "timeout_s": 0.05}, "timeout_s: has to be 0, or 0.1 to 5 s"),

@@ -255,6 +255,7 @@ def test_requests_reach_the_run(page: PageOf, run: FakeRun) -> None:
         ('{"id": 1, "do": "start", "config": ""}', "config"),
         ('{"id": 1, "do": "start"}', "a run is in progress"),
         ('{"id": 1, "do": "stop", "now": true}', "unknown key"),
+        (r'{"id": 1, "do": "mark", "text": "\ud83d"}', "text: has half of a surrogate pair"),
     ],
 )
 def test_what_is_wrong_is_told_and_not_passed_on(
