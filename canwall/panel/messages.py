@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError
 
-from canwall.config import ConfigError, WallChange, check_values, first_error, parse_request
+from canwall.config import ConfigError, WallChange, first_error, parse_request
 from canwall.config.section import Positive, Section
 
 Name = Annotated[str, Field(min_length=1, max_length=200)]
@@ -76,7 +76,6 @@ def parse(text: str) -> dict[str, Any]:
         raise ConfigError(f"not JSON: {error}") from None
     if not isinstance(message, dict):
         raise ConfigError("a message has to be an object of JSON")
-    check_values(message)
     return message
 
 

@@ -25,7 +25,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
-from canwall.config import ConfigError, first_error
+from canwall.config import ConfigError, check_values, first_error
 from canwall.errors import InputError, one_line
 from canwall.panel.messages import Start, parse
 from canwall.panel.pages import MOST_PAGES, Page
@@ -68,8 +68,10 @@ def make_app(session: Session, access: Access, more: Sequence[BaseRoute] = ()) -
         return _json({"configs": await run_in_threadpool(session.launcher.listed)})
 
     async def start(request: Request) -> Response:
+        message = parse((await request.body()).decode(errors="replace"))
+        check_values(message)
         try:
-            given = Start.model_validate(parse((await request.body()).decode(errors="replace")))
+            given = Start.model_validate(message)
         except ValidationError as error:
             raise ConfigError(first_error(error, Start)) from None
         return _json({"ok": True} | await session.start(given))
@@ -152,6 +154,7 @@ async def _answer(text: str, page: Page, session: Session) -> None:
         number = message.get("id")
         if not isinstance(number, int):
             raise ConfigError("id: has to be an integer")
+        check_values(message)
         answer = await session.answer(page, message)
     except ConfigError as error:
         answer = {"ok": False, "error": str(error)}

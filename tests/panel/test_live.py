@@ -270,6 +270,16 @@ def test_what_is_wrong_is_told_and_not_passed_on(
     assert page.ask("mark", text="still here")["ok"]
 
 
+@pytest.mark.parametrize("seed", ["-1", "1" * 30, r'"\u0000"', r'"\ud83d"'])
+def test_answer_has_the_number_of_a_request_with_a_value_that_is_none(
+    page: PageOf, seed: str
+) -> None:
+    page.socket.send(f'{{"id": 5, "do": "blind_begin", "procedure": "staircase", "seed": {seed}}}')
+    answer = page.until(lambda m: isinstance(m, dict) and "answer" in m)
+    assert answer["answer"] == 5
+    assert answer["error"].startswith("seed: ")
+
+
 @pytest.mark.parametrize("message", ["x" * 65_537, b"\x00" * 65_537, b"bytes"])
 def test_page_that_sends_what_no_page_does_is_closed(
     page: PageOf, open_page: Callable[[], PageOf], message: str | bytes
