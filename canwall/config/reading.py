@@ -206,6 +206,7 @@ _TOML_TYPES = {
     "too_long": "a pair",
     "is_instance_of": "a path in quotes",
     "string_too_short": "a text that is not empty",
+    "too_short": "an array that is not empty",
 }
 
 

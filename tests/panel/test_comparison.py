@@ -252,7 +252,10 @@ def test_staircases_of_two_laws_are_those_of_the_study(tmp_path: Path) -> None:
         ({"procedure": "comparison", "question": "nicer"}, "question: has to be"),
         ({"procedure": "comparison", "walls": [{"stifness": 1}]}, "walls.0.stifness: unknown key"),
         ({"procedure": "comparison", "walls": [{"limits": {"torque_nm": 1}}]}, "limits: walls"),
-        ({"procedure": "comparison", "factors": []}, "factors: has to"),
+        (
+            {"procedure": "comparison", "factors": []},
+            "factors: has to be an array that is not empty",
+        ),
         ({"procedure": "comparison", "repeats": 0}, "repeats: has to be"),
         ({"procedure": "comparison", "repeats": 100, "factors": [2.0] * 11}, "1100 trials"),
         ({"procedure": "staircase", "start": 600}, "start 600: has to be"),
