@@ -50,6 +50,12 @@ def test_answers_that_do_not_overlap_have_no_function(chosen: list[int]) -> None
     assert fit_psychometric([0.5, 1.0, 2.0], chosen, [10, 10, 10]) is None
 
 
+@pytest.mark.parametrize("chosen", [[0, 1, 1, 1, 1, 0], [3, 3, 4, 2, 2, 4]])
+def test_answers_that_do_not_depend_on_the_ratio_have_no_function(chosen: list[int]) -> None:
+    # These ratios are no mirror images to the last digit: there is a slope, of some 1e-4.
+    assert fit_psychometric([0.5, 0.71, 0.84, 1.19, 1.41, 2.0], chosen, [6] * 6) is None
+
+
 def test_an_observer_is_found_again() -> None:
     random = np.random.default_rng(1)
     ratios = [0.5, 0.7, 0.9, 1.1, 1.4, 2.0]
