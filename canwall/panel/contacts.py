@@ -158,8 +158,9 @@ class ContactMeter:
         touches_still = bool(metrics.contacts(y[-1:], force[-1:]))
         for touched in metrics.contacts(y, force):
             lasts = touches_still and touched.stop == len(rows)
-            # Before the first row of all, or of those after a gap, it may have lasted already.
-            whole = touched.start > 0
+            # Before the first row of all, or of those after a gap, it may have lasted already; and
+            # a wall that fades in around the handle has not been struck.
+            whole = touched.start > 0 and bool(rendering[touched.start - 1])
             yield self._measured(rows[touched], max(new - touched.start, 0), lasts, whole)
 
     def _measured(self, rows: NDArray[np.void], known: int, lasts: bool, whole: bool) -> Stretch:

@@ -22,3 +22,13 @@ def test_a_wall_that_moves_is_no_motion_of_the_handle(side: float) -> None:
     assert contact.energy_j == pytest.approx(2.0 * (0.5 + 0.2))
     assert not contact.passive
     assert (contact.depth_rad, contact.peak_force_nm) == (1.3, 2.0)
+
+
+def test_wall_that_fades_in_around_the_handle_is_no_contact() -> None:
+    y = np.array([-1.0, -1.0, -2.0, -0.5, 0.5, 0.5, -1.0, -1.0, 0.5, 0.5])
+    rows = np.zeros(len(y), ROW)
+    rows["j"], rows["y"] = np.arange(len(rows)), y
+    rows["force_applied"][2:], rows["phase"][2:] = np.maximum(-y[2:], 0.0), Phase.RENDERING
+    meter = ContactMeter(Scale(1e-3, 1e-6, 1e-3))
+    (contact,) = [s.ended for part in (rows[:3], rows[3:]) for s in meter.take(part) if s.ended]
+    assert (contact.n, contact.depth_rad) == (1, 1.0)
