@@ -104,10 +104,17 @@ class Comparison:
             self._shown, self._cycles[name] = name, cycle
             return cycle
 
-    def strike_ended(self) -> None:
-        """Show the other wall, if each strike is to do so. Raises ConfigError as `show`."""
+    def strike_ended(self, began: int) -> None:
+        """Show the other wall, if each strike is to do so. Raises ConfigError as `show`.
+
+        Args:
+            began: SYNC count at which the strike began; one that began on another wall, as that of
+                the trial before, which may end after its answer, does not count.
+        """
         with self._lock:
-            if self._procedure is not None and self._procedure.switches and self._shown:
+            if self._procedure is None or not self._procedure.switches or not self._shown:
+                return
+            if began > self._cycles[self._shown]:
                 self.show("2" if self._shown == "1" else "1")
 
     def answer(self, answer: str | int) -> None:

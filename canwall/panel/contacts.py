@@ -120,15 +120,19 @@ class ContactMeter:
         self._running: _Running | None = None
         self._contacts = 0
         self._free_since_s: float | None = None
+        self._struck = 0
 
-    def strike_ended(self) -> bool:
-        """Return True once after each strike, when a contact would no more belong to it."""
+    def strike_ended(self) -> int | None:
+        """Return the SYNC count at which a strike began, once after each of them; otherwise None.
+
+        A strike has ended when a contact would no more belong to it.
+        """
         if self._free_since_s is None or self._last is None or self.in_contact:
-            return False
+            return None
         if float(self._last["t_s"][0]) - self._free_since_s <= metrics.STRIKE_GAP_S:
-            return False
+            return None
         self._free_since_s = None
-        return True
+        return self._struck
 
     @property
     def in_contact(self) -> bool:
@@ -167,6 +171,8 @@ class ContactMeter:
         running, begins = self._running, self._running is None
         if running is None:
             first, known = rows[0], 0
+            if self._free_since_s is None:
+                self._struck = int(first["j"])
             law = int(first["law"])
             name = self._scale.laws[law] if law < len(self._scale.laws) else ""
             running = _Running(float(first["t_s"]), name, float(first["stiffness"]), whole)

@@ -86,8 +86,12 @@ class Audience(Protocol):
     def attached(self, run: "Attached | None") -> None:
         """Take a new run, or that there is none."""
 
-    def strike_ended(self) -> None:
-        """Take the end of a strike: the handle is free, and has been for a moment."""
+    def strike_ended(self, began: int) -> None:
+        """Take the end of a strike: the handle is free, and has been for a moment.
+
+        Args:
+            began: SYNC count at which it began.
+        """
 
     @property
     def is_blind(self) -> bool:
@@ -259,8 +263,9 @@ class Follower:
             frames.append(contact_frame(slope, new["t_s"], new["y"], new["force_applied"]))
             if stretch.ended is not None:
                 self._tell_contact(stretch.ended, blind)
-        if self._meter.strike_ended():
-            self._audience.strike_ended()
+        began = self._meter.strike_ended()
+        if began is not None:
+            self._audience.strike_ended(began)
         signals = self._buckets.take(rows)
         if blind:
             for values in signals[1:]:

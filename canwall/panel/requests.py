@@ -66,10 +66,10 @@ class RunRequests:
             self._tell("ab", **self._ab.state())
         self._tell("blind", **self.comparison.state())
 
-    def strike_ended(self) -> None:
+    def strike_ended(self, began: int) -> None:
         """Show the other wall of a blind comparison, if each strike is to do so."""
         if self.comparison.active:
-            self.comparison.strike_ended()
+            self.comparison.strike_ended(began)
             self.tell()
 
     def run_ended(self) -> None:

@@ -132,10 +132,10 @@ class Session:
         if self._to_run is not None:
             self._submit(self._to_run.tell)
 
-    def strike_ended(self) -> None:
-        """Take the end of a strike."""
+    def strike_ended(self, began: int) -> None:
+        """Take the end of a strike that began at a SYNC count."""
         if self.is_blind and self._to_run is not None:
-            self._submit(self._to_run.strike_ended)
+            self._submit(partial(self._to_run.strike_ended, began))
 
     def _submit(self, call: Callable[[], object]) -> None:
         """Have something done in the thread of requests; pages are told what went wrong."""

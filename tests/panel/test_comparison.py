@@ -179,7 +179,9 @@ def test_answers_survive_whatever_happens(tmp_path: Path) -> None:
     made = comparison(run, tmp_path, switch="strike")
     with pytest.raises(ConfigError, match="feel wall 2"):
         made.answer(1)
-    made.strike_ended()
+    made.strike_ended(run.cycle)  # it began before the wall was in force
+    assert made.state()["wall"] == "1"
+    made.strike_ended(run.cycle + 1)
     assert made.state()["wall"] == "2"
     run.refuses = True
     with pytest.raises(ConfigError, match="the run refuses it"):
@@ -187,7 +189,7 @@ def test_answers_survive_whatever_happens(tmp_path: Path) -> None:
     assert len(rows(tmp_path, "comparison.csv")) == 1
     assert (made.state()["trial"], made.state()["wall"]) == (2, None)
     made.show(1)
-    made.strike_ended()
+    made.strike_ended(run.cycle + 1)
     table = tmp_path / "comparison.csv"
     kept = table.read_bytes()
     table.unlink()

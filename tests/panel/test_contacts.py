@@ -32,3 +32,18 @@ def test_wall_that_fades_in_around_the_handle_is_no_contact() -> None:
     meter = ContactMeter(Scale(1e-3, 1e-6, 1e-3))
     (contact,) = [s.ended for part in (rows[:3], rows[3:]) for s in meter.take(part) if s.ended]
     assert (contact.n, contact.depth_rad) == (1, 1.0)
+
+
+def test_a_strike_is_known_by_the_cycle_in_which_it_began() -> None:
+    y = np.ones(700)
+    y[100:150] = y[200:250] = y[500:510] = -1.0
+    rows = np.zeros(len(y), ROW)
+    rows["j"], rows["phase"], rows["y"] = np.arange(len(rows)), Phase.RENDERING, y
+    rows["t_s"] = 1e-3 * rows["j"]
+    meter = ContactMeter(Scale(1e-3, 1e-6, 1e-3))
+    ended = []
+    for part in np.split(rows, 14):
+        for _ in meter.take(part):
+            pass
+        ended.append(meter.strike_ended())
+    assert [began for began in ended if began is not None] == [100]
