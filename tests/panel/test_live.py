@@ -464,7 +464,7 @@ def test_blind_comparison_hides_the_wall(
 def test_run_that_ends_ends_its_blind_comparison(page: PageOf, run: FakeRun) -> None:
     assert page.ask("blind_begin", procedure="comparison", repeats=1)["ok"]
     run.status_now |= {"ended": True}
-    assert page.event("blind", running=False)["text"] == "the run has ended"
+    assert page.event("blind", phase="ended")["text"] == "the run has ended"
 
 
 def test_presets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
