@@ -1,6 +1,7 @@
 """Computation of the pieces of a sweep on a Dask cluster, with its failures as one line each."""
 
 import asyncio
+import functools
 import logging
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from canwall.errors import InputError, RunFailedError
 from canwall.extras import need
-from canwall.sweep.dataset import versions
+from canwall.sweep.dataset import digest, files, versions
 from canwall.sweep.plan import PieceResult, Plan, compute_piece
 
 #: Timeouts for reaching a scheduler, and for connecting a client to it [s].
@@ -25,7 +26,7 @@ def compute_on_cluster(plan: Plan, pieces: Sequence[int], address: str) -> Itera
     Raises:
         InputError: If there is no scheduler at the address, or no Dask here.
         RunFailedError: If the scheduler is lost, or if scheduler or workers have other software
-            than this machine.
+            than this machine, or other laws.
     """
     need("dask")
     import distributed
@@ -36,12 +37,13 @@ def compute_on_cluster(plan: Plan, pieces: Sequence[int], address: str) -> Itera
         if name.partition(".")[0] == "distributed":
             logging.getLogger(name).setLevel(logging.CRITICAL)
     client = _connect(address)
+    read = {path: digest(path) for path in files(plan)}
     try:
         # The scheduler drops what is unfinished when the client leaves.
         with client:
             jobs = {
                 client.submit(
-                    _compute_checked, versions(), plan, piece, pure=False, retries=2
+                    _compute_checked, versions(), read, plan, piece, pure=False, retries=2
                 ): piece
                 for piece in pieces
             }
@@ -60,13 +62,30 @@ def compute_on_cluster(plan: Plan, pieces: Sequence[int], address: str) -> Itera
         ) from None
 
 
-def _compute_checked(needed: dict[str, str], plan: Plan, piece: int) -> NDArray[np.void]:
-    """Compute a piece on a worker. Raises RunFailedError if its versions are not the needed."""
+def _compute_checked(
+    needed: dict[str, str], read: dict[str, str], plan: Plan, piece: int
+) -> NDArray[np.void]:
+    """Compute a piece on a worker. Raises RunFailedError unless versions and files are the same."""
     if (found := versions()) != needed:
         wrong = [name for name in needed if found[name] != needed[name]]
         theirs, ours = (", ".join(f"{n} {v[n]}" for n in wrong) for v in (found, needed))
         raise RunFailedError(f"a worker has {theirs}; needed: {ours}")
+    for path, expected in read.items():
+        if _first_digest(path) != expected:
+            raise RunFailedError(
+                f"a worker has another {path}, or has read it before it changed; see that it is "
+                "the same there, and start the workers again"
+            )
     return compute_piece(plan, piece)
+
+
+@functools.cache
+def _first_digest(path: str) -> str | None:
+    """Return the digest with which a file was found first, as a process reads a law once."""
+    try:
+        return digest(path)
+    except OSError:
+        return None
 
 
 def _connect(address: str) -> Any:

@@ -58,18 +58,23 @@ def plan_json(plan: Plan) -> str:
             "axes": [[axis.name, *axis.values] for axis in plan.axes],
             "through": plan.through,
             "configuration": plan.base.to_toml(),
-            "files": _digests(plan),
+            "files": {path: digest(path) for path in files(plan)},
             "versions": versions(),
         }
     )
 
 
-def _digests(plan: Plan) -> dict[str, str]:
-    """Return the digests of the files that plan and configuration name: laws and dictionary."""
+def files(plan: Plan) -> list[str]:
+    """Return the paths of the files that plan and configuration name: laws and dictionary."""
     named = [str(plan.base.drive.eds), plan.base.wall.law]
     named += [value for axis in plan.axes for value in axis.values if isinstance(value, str)]
-    files = {path for name in named if (path := Path(name.rpartition(":")[0] or name)).is_file()}
-    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(files)}
+    paths = {path for name in named if (path := Path(name.rpartition(":")[0] or name)).is_file()}
+    return [str(path) for path in sorted(paths)]
+
+
+def digest(path: str) -> str:
+    """Return the SHA-256 of a file. Raises OSError."""
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
 def assemble_dataset(plan: Plan, pieces: Mapping[int, NDArray[np.void]]) -> xr.Dataset:

@@ -215,6 +215,22 @@ def test_cluster_with_other_software_computes_nothing(
     assert not list(tmp_path.glob("a.nc*"))
 
 
+def test_law_that_has_changed_since_a_worker_read_it_is_not_computed_with(
+    cluster: Cluster, tmp_path: Path
+) -> None:
+    law = tmp_path / "law.py"
+    sweep = ["sweep", SIM_CONFIG, "--law", f"{law}:spring", "--stiffness", 10, "--axis", "speed=1"]
+    law.write_text("def spring(wall):\n    return -wall.stiffness * min(wall.y, 0.0)\n")
+    done = command(*sweep, "--output", tmp_path / "a.nc", "--dask", cluster.address)
+    assert (done.returncode, done.stderr) == (0, "")
+    law.write_text("def spring(wall):\n    return -2.0 * wall.stiffness * min(wall.y, 0.0)\n")
+    done = command(*sweep, "--output", tmp_path / "b.nc", "--dask", cluster.address)
+    assert done.returncode == 1
+    assert f"a worker has another {law}, or has read it before it changed" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not list(tmp_path.glob("b.nc*"))
+
+
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
 def test_what_was_interrupted_goes_on(whole: Path, tmp_path: Path, end: signal.Signals) -> None:
     output = tmp_path / "a.nc"
