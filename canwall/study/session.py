@@ -69,7 +69,8 @@ class Session:
                 "run": base.run.model_copy(update={"duration_s": seconds}),
             }
         )
-        self.laws = [named_law(with_law(base, law)) for law in laws or [named_law(base)]]
+        named = (named_law(with_law(base, law)) for law in laws or [named_law(base)])
+        self.laws = list(dict.fromkeys(named))
         run_laws(self._settings(self.laws, base.wall.stiffness_nm_per_rad))
         self._folder, self._terminal = folder, terminal
         self._steps = 0

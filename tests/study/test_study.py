@@ -14,10 +14,11 @@ import pytest
 from commands import COMMAND, PATIENCE_S, Record, config_file, torque_is_on, wait_for
 from hypothesis import example, given
 from hypothesis import strategies as st
-from rig import eds_with
+from rig import SIM_CONFIG, eds_with
 
+from canwall.config import load
 from canwall.errors import InputError
-from canwall.study.session import Verdict
+from canwall.study.session import Session, Verdict
 from canwall.study.staircase import Staircase, stiffness_limits
 from canwall.study.terminal import SessionEndedError, Terminal
 
@@ -185,6 +186,12 @@ def test_laws_in_turn(folder: Path, people: list[Person]) -> None:
     assert found == [
         *(("2", laws[0], "False"), ("2", laws[1], "True"), ("3", laws[1], "False")),
     ]
+
+
+def test_a_law_that_is_given_twice_is_judged_once(folder: Path) -> None:
+    laws = ["standard", "damped", "standard"]
+    session = Session(load(SIM_CONFIG), laws, folder, ONE, Terminal())
+    assert session.laws == ["standard", "damped"]
 
 
 def test_a_blind_comparison(folder: Path, people: list[Person]) -> None:
