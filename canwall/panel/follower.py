@@ -25,6 +25,7 @@ from canwall.panel.frames import Buckets, contact_frame
 from canwall.panel.launch import StartedRun
 from canwall.panel.pages import Signals
 from canwall.record import RunFolder
+from canwall.record.status import KILLED
 from canwall.strict_json import plain
 
 if TYPE_CHECKING:
@@ -245,10 +246,7 @@ class Follower:
         if status is not None and status["ended"]:
             self._leave("ended", status["trip"] or "the run has ended")
         elif not alive:
-            self._leave(
-                "ended",
-                "the process of the run is dead: the drive's watchdog has to disable the drive",
-            )
+            self._leave("ended", KILLED)
 
     def _show(self, rows: NDArray[np.void]) -> None:
         blind = self._audience.is_blind

@@ -42,7 +42,7 @@ from canwall.record.shared_memory import (
     open_memory,
 )
 from canwall.record.snapshot import Snapshot
-from canwall.record.status import STATUS, Status, to_status
+from canwall.record.status import KILLED, STATUS, Status, to_status
 
 _C = TypeVar("_C", bound=WallChange)
 
@@ -216,14 +216,15 @@ class LiveRun:
 
         Raises RunFailedError if the run has published none.
         """
+        alive = self.alive  # first: then comes its last status
         found = self._status.read()
-        alive = self.alive
         if found is not None:
-            self._last_status = to_status(np.frombuffer(found, STATUS, 1), alive)
+            self._last_status = to_status(np.frombuffer(found, STATUS, 1))
         if self._last_status is None:
             raise RunFailedError(f"{self.folder.path}: the run does not say how it is")
-        if not alive:
-            self._last_status = self._last_status._replace(ended=True)
+        if not alive and not self._last_status.ended:
+            trip = self._last_status.trip or KILLED
+            self._last_status = self._last_status._replace(ended=True, trip=trip)
         return self._last_status
 
     def settings(self) -> LiveSettings:

@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 from canwall.record.columns import Phase
 from canwall.record.histogram import HISTOGRAM, percentile_ns
 
+#: What ended a run that published no end.
+KILLED = "the process of the run is dead: the drive's watchdog has to disable the drive"
+
 #: Lengths of texts [bytes].
 TRIP, STATE, EMCY = 600, 160, 160
 
@@ -113,8 +116,8 @@ class Status(NamedTuple):
     beat_timeout_s: float
 
 
-def to_status(record: NDArray[np.void], alive: bool) -> Status:
-    """Convert a record STATUS, shape (1,), of a process that is still alive or not."""
+def to_status(record: NDArray[np.void]) -> Status:
+    """Convert a record STATUS, shape (1,)."""
     found = record[0]
     same = {name: found[name].item() for name in STATUS.names or () if name in Status._fields}
     texts = {n: same[n].decode(errors="replace") for n in ("trip", "drive_state", "emcy")}
@@ -123,7 +126,7 @@ def to_status(record: NDArray[np.void], alive: bool) -> Status:
     values |= {
         "t_s": found["cycle"].item() * found["cycle_s"].item(),
         "phase": Phase(found["phase"].item()).name.lower(),
-        "ended": bool(found["ended"]) or not alive,
+        "ended": bool(found["ended"]),
         "emcy_code": found["emcy_code"].item() if found["emcy_code"] >= 0 else None,
         "latency_p50_s": percentile_ns(latency, 50.0) * 1e-9,
         "latency_p99_s": percentile_ns(latency, 99.0) * 1e-9,

@@ -146,13 +146,17 @@ def test_status_of_a_run_that_is_killed(memory: LiveMemory, tmp_path: Path) -> N
         status = live.status()
         assert (status.cycle, status.t_s, status.ended) == (500, 1.0, False)
         assert (status.emcy_code, status.trip) == (None, "µ" * 300)
+        record["trip"] = b""
+        memory.publish(record)
+        status = live.status()
         assert live.alive
         memory._status._number[0] += 1  # it was publishing
         other = os.open("/dev/null", os.O_RDONLY)
         os.dup2(other, memory._descriptor)
         os.close(other)
         assert not live.alive
-        assert live.status() == status._replace(ended=True)
+        assert "watchdog" in live.status().trip
+        assert live.status() == status._replace(ended=True, trip=live.status().trip)
         # Its words are still there for whoever has them open.
         live.stop()
         assert memory.controls.stopped
