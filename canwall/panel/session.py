@@ -167,7 +167,7 @@ class Session:
         try:
             content = validated(message)
             if do not in _FREE and not self.pages.has_control(page):
-                raise ConfigError("another page has control; take it first")
+                raise ConfigError("this page does not have control; take it first")
             if do == "stop":
                 return await self._stop()
             if do == "beat":

@@ -367,6 +367,7 @@ def test_control(page: PageOf, run: FakeRun, open_page: Callable[[], PageOf]) ->
     assert "control" in page.ask("end")["error"]
     other.socket.close()
     page.event("control", you=False, others=0)  # nobody's: it is not given without being taken
+    assert page.ask("end")["error"].startswith("this page does not have control")
     assert page.ask("stop")["ok"]  # anybody may
     open_page().event("control", you=True, others=1)
 

@@ -237,7 +237,7 @@ def test_second_page_watches_until_it_takes_control(browser: "Browser", panel: P
     ):
         two.wait_for_text("notice", "This page watches, and can stop.")
         two.page.keyboard.press("ArrowRight")
-        two.wait_for_text("said", "another page has control")
+        two.wait_for_text("said", "this page does not have control")
         two.page.click("#take-control")
         one.wait_for_text("notice", "This page watches")
         one.page.keyboard.press("Space")
