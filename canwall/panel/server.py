@@ -219,6 +219,11 @@ class _Http(_Bounded, H11Protocol):
 class _WebSocket(_Bounded, WebSocketsSansIOProtocol):
     """Socket of a page, closed without its consent once there is nothing more to say."""
 
+    async def send(self, message: Any) -> None:
+        await super().send(message)
+        if message["type"] == "websocket.http.response.body":
+            self.handshake_complete = True  # a refusal is one; uvicorn logs that there was none
+
     async def run_asgi(self) -> None:
         await super().run_asgi()
         self._hurry("closes")

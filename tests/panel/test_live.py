@@ -597,9 +597,12 @@ def test_connection_that_does_not_ask_is_closed(
             assert sock.recv(1) == b""
 
 
-def test_many_pages(beside: PanelBeside, open_page: Callable[[], PageOf]) -> None:
+def test_many_pages(
+    beside: PanelBeside, open_page: Callable[[], PageOf], caplog: pytest.LogCaptureFixture
+) -> None:
     for _ in range(MOST_PAGES):
         open_page()
     wait_until(lambda: len(beside.session.pages) == MOST_PAGES)
     with pytest.raises(Exception, match="503"):
         open_page()
+    assert caplog.text == ""
