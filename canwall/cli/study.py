@@ -34,6 +34,8 @@ _Laws = Annotated[
         autocompletion=complete_law,
     ),
 ]
+#: First wall of a staircase, unless that of the file is softer [N·m/rad].
+_SOFT = 5.0
 _Seconds = Annotated[
     float, typer.Option(min=0.5, max=1e6, help="Seconds for which a wall is rendered.")
 ]
@@ -44,7 +46,10 @@ def staircase(
     config_file: ConfigFile,
     output: _Output,
     law: _Laws = None,
-    start: Annotated[float, typer.Option(help="The first wall [N·m/rad].")] = 5.0,
+    start: Annotated[
+        float | None,
+        typer.Option(help="The first wall [N·m/rad]. Without: 5, or the file's if it is softer."),
+    ] = None,
     ceiling: Annotated[float, typer.Option(help="No wall is stiffer [N·m/rad].")] = 500.0,
     finest: Annotated[float, typer.Option(help="Factor of the last steps.")] = 1.1,
     seconds: _Seconds = 8.0,
@@ -56,6 +61,8 @@ def staircase(
     """
     from canwall.study import Staircase, run_staircases
 
+    if start is None:
+        start = min(_SOFT, settings_from(config_file).wall.stiffness_nm_per_rad)
     steps = Staircase(start, ceiling, finest)
     return _run_session(
         config_file, law, output, seconds, as_json, lambda session: run_staircases(session, steps)

@@ -168,7 +168,7 @@ class Session:
         numbers = {law: _strike_numbers(strikes, law) for law in laws}
         struck = [law for law in laws if numbers[law]]
         if not struck or (len(struck) < len(laws) and not result.outcome.trips):
-            self._terminal.say("Not every law had a strike: once more.")
+            self._terminal.say("Not every law had a strike (--seconds is how long): once more.")
             return None
         answers = {}
         for law in struck:

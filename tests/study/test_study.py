@@ -304,10 +304,14 @@ def test_a_drive_that_is_not_restored_is_told_in_the_end(
     assert errors.startswith("canwall: node 5: not restored: node 5: writing 0x14 to 0x1800:03")
 
 
-def test_ctrl_c_between_two_walls(folder: Path, people: list[Person]) -> None:
-    person = Person("staircase", folder)
+@pytest.mark.parametrize(("of_the_file", "first"), [("50.0", "5"), ("2.0", "2")])
+def test_ctrl_c_between_two_walls(
+    folder: Path, people: list[Person], of_the_file: str, first: str
+) -> None:
+    walls = {"stiffness_nm_per_rad = 50.0": f"stiffness_nm_per_rad = {of_the_file}"}
+    person = Person("staircase", folder, config=config_file(folder.parent / "a.toml", walls))
     people.append(person)
-    person.read_to(BEGINS)
+    assert f"K = {first} N·m/rad" in person.read_to(BEGINS)
     os.kill(person.process.pid, signal.SIGINT)
     code, said, errors = person.end()
     assert (code, errors) == (130, "")
