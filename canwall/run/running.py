@@ -142,11 +142,14 @@ def run_together(
             for axis, folder, of_record in zip(axes, folders, notes, strict=True):
                 of_axis = [*of_record, *monitor.notes] if axis is axes[0] else of_record
                 remarks = remarks_on(axis.setup, axis.settings)
-                remarks += outcome.notes if axis is axes[0] else []
                 kept = not_restored.get(axis.name, [])
-                results.append(
-                    write_result(axis, exchange, monitor, folder, outcome, of_axis, remarks, kept)
+                result = write_result(
+                    axis, exchange, monitor, folder, outcome, of_axis, remarks, kept
                 )
+                if len(axes) > 1:
+                    result.remarks[:] = [f"{axis.name}: {text}" for text in result.remarks]
+                results.append(result)
+            results[0].remarks.extend(outcome.notes)
         except Exception as error:
             if (told := _told(outcome, error)) is error:
                 raise

@@ -79,6 +79,15 @@ def test_trip_of_one_takes_the_torque_from_all(tmp_path: Path) -> None:
         assert kept[-1].split(",")[0] == str(cycle)
 
 
+@pytest.mark.slow
+def test_remarks_name_the_drive(tmp_path: Path) -> None:
+    many = [settings_of(5), settings_of(6, {"drive.rated_torque_nm": 0.3})]
+    first, second = run_all(many, tmp_path / "run")
+    assert first.remarks == []
+    assert any("drive.rated_torque_nm = 0.3" in remark for remark in second.remarks)
+    assert all(remark.startswith("node 6: ") for remark in second.remarks)
+
+
 @pytest.mark.parametrize(
     ("second", "message"),
     [
