@@ -59,12 +59,12 @@ def read_run(
     """
     being_written = folder.is_being_written  # asked first: it may end meanwhile
     signals = read_signals(folder.signals, columns)
+    if signals.num_rows == 0:
+        raise ConfigError(f"{folder.path}: no cycle was recorded")
     if not being_written and os.path.lexists(folder.summary):
         summary = folder.read_summary()
         return RunRecord(signals, summary, _remark(folder, summary))
     signals = read_signals(folder.signals, ROW.names or ())
-    if signals.num_rows == 0:
-        raise ConfigError(f"{folder.path}: no cycle was recorded")
     summary = _summary_of_stream(folder, signals, columns)
     if being_written:
         summary |= {"cut_off": False, "trips": [], "trip_cycle": None}

@@ -232,6 +232,16 @@ def test_rows_of_another_kind_are_no_record(four_strikes: Record, tmp_path: Path
         read_run(folder)
 
 
+def test_record_without_rows_is_told_beside_a_summary_as_well(
+    four_strikes: Record, tmp_path: Path
+) -> None:
+    folder = copy_of(four_strikes.folder, tmp_path / "run", "config.toml", "summary.json")
+    signals = four_strikes.signals
+    pa.parquet.write_table(signals.slice(0, 0), folder.signals)
+    with pytest.raises(ConfigError, match="no cycle was recorded"):
+        read_run(folder)
+
+
 # Standard streams that are closed
 
 
