@@ -110,7 +110,9 @@ def read_signals(
             table = _read_parquet(path, wanted)
         table.validate(full=True)
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; give the folder of a run") from None
+        raise ConfigError(
+            of_several_drives(path.parent) or f"{path}: no such file; give the folder of a run"
+        ) from None
     except (OSError, UnicodeError, pa.ArrowException) as error:
         raise ConfigError(f"{path}: not a record of a run: {reason(error)}") from None
     missing = [name for name in columns if name not in table.column_names]
@@ -359,6 +361,14 @@ def _is_strike(entry: object) -> bool:
         isinstance(entry.get(name), (int, float) if kind is float else kind)
         for name, kind in _STRIKE.items()
     )
+
+
+def of_several_drives(path: Path) -> str:
+    """Return what to do with a folder that holds those of several drives; of others, nothing."""
+    drives = sorted(config.parent.name for config in path.glob("node*/config.toml"))
+    if not drives:
+        return ""
+    return f"{path}: the run of several drives; give the folder of one: {', '.join(drives)}"
 
 
 def lock_folder(path: Path) -> int | None:

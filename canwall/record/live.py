@@ -30,7 +30,7 @@ from canwall.config import (
 )
 from canwall.errors import RunFailedError
 from canwall.record.controls import Controls
-from canwall.record.folder import RunFolder
+from canwall.record.folder import RunFolder, of_several_drives
 from canwall.record.mailbox import Mailbox
 from canwall.record.ring import Ring
 from canwall.record.shared_memory import (
@@ -183,7 +183,8 @@ class LiveRun:
             return cls(folder, folder.read_live())
         except (OSError, ValueError):
             raise ConfigError(
-                f"{folder.path}: no run in progress; give the folder of one that is"
+                of_several_drives(folder.path)
+                or f"{folder.path}: no run in progress; give the folder of one that is"
             ) from None
 
     def __enter__(self) -> Self:

@@ -27,6 +27,7 @@ from canwall.record import ROW, Recorder, RecordError, Ring, RunFolder, read_sig
 from canwall.record.append import put_frame, put_row
 from canwall.record.columns import schema
 from canwall.record.folder import lock_folder
+from canwall.record.live import LiveRun
 from canwall.record.ring import FRAMES, ROWS, to_message
 
 LAWS = ["standard", "half_sample"]
@@ -423,6 +424,14 @@ def test_folder_that_cannot_be_made(tmp_path: Path, where: str) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match=r"cannot be written: .*; choose another --output"):
         RunFolder.create(tmp_path / where, CONFIG)
+
+
+def test_folder_of_several_drives_is_none_of_a_run(tmp_path: Path) -> None:
+    for drive in ("node5", "node6"):
+        RunFolder.create(tmp_path / drive, CONFIG, "../bus.log")
+    for read in (lambda: read_signals(RunFolder(tmp_path).signals), lambda: LiveRun.open(tmp_path)):
+        with pytest.raises(ConfigError, match="give the folder of one: node5, node6"):
+            read()
 
 
 def test_what_is_no_record(tmp_path: Path) -> None:
