@@ -365,7 +365,9 @@ def _is_strike(entry: object) -> bool:
 
 def of_several_drives(path: Path) -> str:
     """Return what to do with a folder that holds those of several drives; of others, nothing."""
-    drives = sorted(config.parent.name for config in path.glob("node*/config.toml"))
+    drives: list[str] = []
+    with contextlib.suppress(OSError, ValueError):  # of a name that is none of a file
+        drives = sorted(config.parent.name for config in path.glob("node*/config.toml"))
     if not drives:
         return ""
     return f"{path}: the run of several drives; give the folder of one: {', '.join(drives)}"
