@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from canwall.bus import DataFrame
 from canwall.bus.raw_socket import CAN_EFF, CAN_ERR, CAN_RTR
 from canwall.compiled import data_to_number, number_to_data
-from canwall.cycle.core import Handling, Want, proceed, take
+from canwall.cycle.core import Handling, Want, proceed, proceed_without, take
 from canwall.cycle.transport import CycleFrames
 from canwall.drive import Link
 
@@ -41,11 +41,25 @@ class PythonCanTransport:
         """Move frames until the core wants Python. Raises can.CanError if the bus fails."""
         core, link = self._core, self._link
         now_ns = time.perf_counter_ns
+        # In simulated time, drives of this process have answered all once they are served; another
+        # producer's SYNC comes when it likes.
+        measured = core["real_time"][0] or core["external_sync"][0]
+        serve, served = (None if measured else link.idle), False
         want = proceed(core, now_ns())
         while True:
             if want == _SEND:
+                served = False
                 self._send()
                 want = proceed(core, now_ns())
+            elif want == _FRAME and serve is not None:
+                message = link.receive_unlogged(0.0)
+                if message is not None:
+                    want = self._take(message)
+                elif served:
+                    want = proceed_without(core, now_ns())
+                else:
+                    serve()
+                    served = True
             elif want == _FRAME:
                 timeout_s = (int(self._until_ns[0]) - now_ns()) * 1e-9
                 message = link.receive_unlogged(max(0.0, timeout_s))

@@ -90,6 +90,20 @@ def test_tpdo_that_comes_twice_or_late_is_not_taken_for_the_next(rig: Rig) -> No
     assert len(tpdos) == 1 + 2 * 2 + 1
 
 
+def test_lost_tpdo_of_an_embedded_drive_is_not_waited_for(
+    make_rig: RigFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In simulated time: a drive that has been served has said all there is."""
+    monkeypatch.setattr(exchange_module, "_SIMULATED_TIMEOUT_S", 20.0)
+    loop = Loop(make_rig())
+    begin = time.monotonic()
+    for muted in ({TPDO1}, set[int](), {TPDO1}):
+        loop.rig.tampering.mute = muted
+        loop.exchange.cycle()
+    assert loop.rows()["received"].tolist() == [False, True, False]
+    assert time.monotonic() - begin < 10.0
+
+
 def test_timing_columns(rig: Rig) -> None:
     loop = Loop(rig)
     for _ in range(3):
