@@ -51,22 +51,20 @@ class PythonCanTransport:
                 served = False
                 self._send()
                 want = proceed(core, now_ns())
-            elif want == _FRAME and serve is not None:
-                message = link.receive_unlogged(0.0)
+            elif want in (_FRAME, _DRAIN):
+                timeout_s = 0.0
+                if want == _FRAME and serve is None:
+                    timeout_s = max(0.0, (int(self._until_ns[0]) - now_ns()) * 1e-9)
+                message = link.receive_unlogged(timeout_s)
                 if message is not None:
                     want = self._take(message)
+                elif want == _DRAIN or serve is None:
+                    want = proceed(core, now_ns())
                 elif served:
                     want = proceed_without(core, now_ns())
                 else:
                     serve()
                     served = True
-            elif want == _FRAME:
-                timeout_s = (int(self._until_ns[0]) - now_ns()) * 1e-9
-                message = link.receive_unlogged(max(0.0, timeout_s))
-                want = proceed(core, now_ns()) if message is None else self._take(message)
-            elif want == _DRAIN:
-                message = link.receive_unlogged(0.0)
-                want = proceed(core, now_ns()) if message is None else self._take(message)
             elif want == _SLEEP:
                 time.sleep(max(0.0, (int(self._until_ns[0]) - now_ns()) * 1e-9))
                 want = proceed(core, now_ns())

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from canwall.errors import InputError, RunFailedError
 from canwall.extras import need
-from canwall.sweep.dataset import digest, files, versions
+from canwall.sweep.dataset import digest, digests, versions
 from canwall.sweep.plan import PieceResult, Plan, compute_piece
 
 #: Timeouts for reaching a scheduler, and for connecting a client to it [s].
@@ -37,7 +37,7 @@ def compute_on_cluster(plan: Plan, pieces: Sequence[int], address: str) -> Itera
         if name.partition(".")[0] == "distributed":
             logging.getLogger(name).setLevel(logging.CRITICAL)
     client = _connect(address)
-    read = {path: digest(path) for path in files(plan)}
+    read = digests(plan)
     try:
         # The scheduler drops what is unfinished when the client leaves.
         with client:

@@ -58,18 +58,18 @@ def plan_json(plan: Plan) -> str:
             "axes": [[axis.name, *axis.values] for axis in plan.axes],
             "through": plan.through,
             "configuration": plan.base.to_toml(),
-            "files": {path: digest(path) for path in files(plan)},
+            "files": digests(plan),
             "versions": versions(),
         }
     )
 
 
-def files(plan: Plan) -> list[str]:
-    """Return the paths of the files that plan and configuration name: laws and dictionary."""
+def digests(plan: Plan) -> dict[str, str]:
+    """Return the digests of the files that plan and configuration name: laws and dictionary."""
     named = [str(plan.base.drive.eds), plan.base.wall.law]
     named += [value for axis in plan.axes for value in axis.values if isinstance(value, str)]
     paths = {path for name in named if (path := Path(name.rpartition(":")[0] or name)).is_file()}
-    return [str(path) for path in sorted(paths)]
+    return {str(path): digest(str(path)) for path in sorted(paths)}
 
 
 def digest(path: str) -> str:

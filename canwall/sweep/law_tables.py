@@ -375,8 +375,8 @@ def _write_cap(dataset: xr.Dataset) -> Iterator[str]:
                 of_kind = dataset[criterion].sel(some)
                 each = [of_kind.sel(operator=operator) for operator in operators]
                 yield _row(name, [f"{int(these.sum())} of {these.size}" for these in each])
+            ripple = dataset["settling_ripple"].sel(some)
             for name, quantile in (("median", 0.5), ("95 % of strikes", 0.95)):
-                ripple = dataset["settling_ripple"].sel(some)
                 cells = [_quantile(ripple.sel(operator=o), quantile) for o in operators]
                 yield _row(f"felt while it comes to rest [N], {name}", cells)
             for description, quantile in (("least", 0.0), ("median", 0.5)):

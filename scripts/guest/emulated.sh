@@ -50,7 +50,8 @@ export CANWALL_EMBEDDED_RECORD="$root/.cache/guest/embedded" CANWALL_CONTROLLERS
 accelerator() {
   accelerator=kvm
   mkdir "$work/proof"
-  if [ -w /dev/kvm ] && grep -qw 'vmx\|svm' /proc/cpuinfo && boot_emulated "$work/proof" "$proof" true >/dev/null 2>&1 &&
+  if [ -w /dev/kvm ] && grep -qw 'vmx\|svm' /proc/cpuinfo &&
+    boot_emulated "$work/proof" "$proof" true >/dev/null 2>&1 &&
     [ "$(cat "$work/proof/status")" = 0 ]; then
     echo kvm
   else

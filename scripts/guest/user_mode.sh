@@ -6,8 +6,13 @@ memory=2048
 #: Mappings that a process of the host may have; one of the guest has one for almost every page.
 mappings=1048576
 
-# Fails where user-mode Linux does not run. Debian's is told how large registers are by xstate.c.
+# Exits where user-mode Linux does not run, so call it in a subshell. Debian's is told how large
+# registers are by xstate.c. The limit of mappings stays raised.
 prepare_user_mode() {
+  unavailable() {
+    echo "canwall: no user-mode Linux, QEMU instead: $1" >&2
+    exit 1
+  }
   install_packages gcc:cc
   (
     flock 9
@@ -16,10 +21,11 @@ prepare_user_mode() {
     cc -O2 -shared -fPIC -o "$cache/user_mode/xstate.so" "$root/scripts/guest/xstate.c" -ldl
   ) 9>"$cache/lock"
   limit=/proc/sys/vm/max_map_count
-  [ "$(cat $limit)" -ge $mappings ] || as_root sh -c "echo $mappings >$limit" 2>/dev/null || return
+  [ "$(cat $limit)" -ge $mappings ] || as_root sh -c "echo $mappings >$limit" 2>/dev/null ||
+    unavailable "as root: sysctl vm.max_map_count=$mappings"
   mkdir "$work/user_mode"
   boot_user_mode "$work/user_mode" "$proof" true >/dev/null 2>&1 || true
-  [ "$(cat "$work/user_mode/status")" = 0 ]
+  [ "$(cat "$work/user_mode/status")" = 0 ] || unavailable "it does not start"
 }
 
 # $1: folder, in which the guest's exit code is in `status` after it; $2: seconds; the rest: COMMAND.
