@@ -28,8 +28,9 @@ from canwall.drive import DriveNode, Link
 from canwall.stopping import stop_on_signals
 from canwall.supervised import given_up
 
-#: The hand strikes from cycle 200 on; here there is a torque.
-CYCLES = 260
+#: The hand strikes from cycle 40 on; here there is a torque.
+STRIKE_S = 0.04
+CYCLES = 100
 
 #: Patience with a drive that does not answer, on the way out.
 _SDO_TIMEOUT_S = 0.05
@@ -81,6 +82,7 @@ def render(rig: Rig, fault: Fault, before: Callable[[Loop], None], outcome: Outc
     leave = loop_module.Loop.leave
 
     def begin(self: loop_module.Loop) -> bool:
+        assert rig.rpdos()[-1][1] != 0
         before(loop)
         # From here on only: set-up has its time, the cycles before are as fast as ever.
         loop.rig.node._node.sdo.RESPONSE_TIMEOUT = _SDO_TIMEOUT_S
@@ -159,7 +161,13 @@ def kinds() -> dict[str, Callable[[], None]]:
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("kind", kinds())
 def test_fault_at_every_call(make_rig: RigFactory, kind: str, way: str) -> None:
-    settings = settings_with({"wall.law": "half_sample", "drive.sdo_timeout_s": 2.0})
+    settings = settings_with(
+        {
+            "wall.law": "half_sample",
+            "drive.sdo_timeout_s": 2.0,
+            "simulation.hand": {"first_strike_s": STRIKE_S},
+        }
+    )
 
     def tried(fault: Fault, outcome: Outcome, way: str) -> Rig:
         rig: Rig = make_rig(settings)
