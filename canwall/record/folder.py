@@ -141,10 +141,15 @@ def numbers(signals: "pa.Table", name: str) -> NDArray[Any]:
 
 
 def _read_parquet(path: Path, columns: list[str] | None) -> "pa.Table":
+    import pyarrow as pa
     import pyarrow.parquet as pq
 
     with pq.ParquetFile(path, page_checksum_verification=True) as file:
-        return file.read(columns)
+        table = file.read(columns)
+        # The number of rows stands there twice, and has no checksum.
+        if table.num_rows != file.metadata.num_rows:
+            raise pa.ArrowInvalid(f"{table.num_rows} rows, not {file.metadata.num_rows}")
+        return table
 
 
 def _read_stream(path: Path, columns: list[str] | None) -> "pa.Table":

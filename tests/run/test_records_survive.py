@@ -6,11 +6,13 @@ import shlex
 import shutil
 import signal
 import subprocess
+from contextlib import suppress
 from pathlib import Path
 
 import matplotlib.image
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from commands import (
     COMMAND,
@@ -188,6 +190,20 @@ def test_damaged_rows_are_not_read_as_data(four_strikes: Record, tmp_path: Path)
         except ConfigError:
             found += 1
     assert found > 50
+
+
+@pytest.mark.slow
+def test_any_flipped_bit_that_costs_rows_is_found(tmp_path: Path) -> None:
+    rows = pa.table({"j": pa.array(range(40), pa.int64())})
+    path = tmp_path / "signals.parquet"
+    pq.write_table(rows, path, write_page_checksum=True)
+    whole = path.read_bytes()
+    for bit in range(8 * len(whole)):
+        damaged = bytearray(whole)
+        damaged[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(damaged)
+        with suppress(ConfigError):
+            assert read_signals(path).equals(rows), bit
 
 
 @pytest.mark.parametrize(
