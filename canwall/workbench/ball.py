@@ -7,6 +7,7 @@ bias force, and its force acts at once: D = 0.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Integral
 from pathlib import Path
 from types import MappingProxyType
 
@@ -85,8 +86,10 @@ class Ball:
         for name in ("gravity", "height", "speed"):
             if not math.isfinite(getattr(self, name)):
                 raise InputError(f"{name} has to be a number, not {getattr(self, name):g}")
-        if not 0 <= self.periods <= MAX_PERIODS:
-            raise InputError(f"periods has to be 0 … {MAX_PERIODS}, not {self.periods}")
+        if not (isinstance(self.periods, Integral) and 0 <= self.periods <= MAX_PERIODS):
+            raise InputError(
+                f"periods has to be a whole number, 0 … {MAX_PERIODS}, not {self.periods}"
+            )
         hardest = self.period * math.sqrt((self.stiffness + self.spring) / self.mass)
         if not hardest <= MAX_THETA:
             raise InputError(f"T·√(K/m) has to be {MAX_THETA:g} or below, not {hardest:g}")

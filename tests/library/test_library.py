@@ -372,6 +372,12 @@ def test_law_that_others_cannot_have_is_refused() -> None:
         canwall.sweep(None, {"stiffness": 20.0}, stiffness=10.0)
 
 
+def test_ball_falls_for_a_whole_number_of_periods() -> None:
+    assert canwall.ball("continuous", periods=np.int64(3)).sizes == {"t": 4}
+    with pytest.raises(InputError, match="periods has to be a whole number, .* not 2.5"):
+        canwall.ball("continuous", periods=2.5)  # type: ignore[arg-type]
+
+
 def test_ball_falls_and_has_units() -> None:
     dropped = canwall.ball("continuous", periods=300)
     free = dropped.isel(t=slice(0, 14))

@@ -161,7 +161,7 @@ def test_installed_command(tmp_path: Path) -> None:
         ("--gravity nan", "gravity has to be a number, not nan"),
         ("--height -inf", "height has to be a number, not -inf"),
         ("--speed fast", "Invalid value for '--speed': "),
-        ("--periods -1", "periods has to be 0 … 100000000, not -1"),
+        ("--periods -1", "periods has to be a whole number, 0 … 100000000, not -1"),
         ("--periods 100000000000", "periods "),
         ("--stiffness 1e14", "T·√(K/m) has to be 10000 or below"),
         ("--option length=nan", "--option length=nan: has to be NAME=NUMBER"),
