@@ -7,7 +7,6 @@ bias force, and its force acts at once: D = 0.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from numbers import Integral
 from pathlib import Path
 from types import MappingProxyType
 
@@ -86,7 +85,7 @@ class Ball:
         for name in ("gravity", "height", "speed"):
             if not math.isfinite(getattr(self, name)):
                 raise InputError(f"{name} has to be a number, not {getattr(self, name):g}")
-        if not (isinstance(self.periods, Integral) and 0 <= self.periods <= MAX_PERIODS):
+        if not (isinstance(self.periods, int | np.integer) and 0 <= self.periods <= MAX_PERIODS):
             raise InputError(
                 f"periods has to be a whole number, 0 … {MAX_PERIODS}, not {self.periods}"
             )
