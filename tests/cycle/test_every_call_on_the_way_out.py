@@ -28,7 +28,7 @@ from canwall.drive import DriveNode, Link
 from canwall.stopping import stop_on_signals
 from canwall.supervised import given_up
 
-#: The hand strikes from cycle 40 on; here there is a torque.
+#: The hand begins to strike; after so many cycles there is a torque.
 STRIKE_S = 0.04
 CYCLES = 100
 
