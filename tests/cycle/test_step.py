@@ -16,7 +16,7 @@ from canwall.config import Settings
 from canwall.cycle import Trip, fade_in, make_cycle, run_laws, set_wall, step
 from canwall.cycle.state import RECENT_CYCLES, fade_over, start_at
 from canwall.drive import DriveSetup, Field, PdoLayout
-from canwall.record import ROW, Phase
+from canwall.record import ROW, TIMING_COLUMNS, Phase
 from canwall.units import DriveUnits
 from canwall.walls import UnknownLawError, age_at
 
@@ -166,6 +166,15 @@ def test_row_of_a_cycle() -> None:
     assert row["torque_applied"] == row["force_applied"] == 0.0
     assert row["stiffness"] == 50.0
     assert row["wall_position_rad"] == 0.01
+
+
+def test_every_column_is_filled() -> None:
+    """Those of the clock are the core's."""
+    wall = Wall()
+    wall.row.view(np.uint8)[:] = untouched = 0xA5
+    wall.at(20)
+    left = [n for n in ROW.names or () if set(wall.row[n].tobytes()) == {untouched}]
+    assert left == [*TIMING_COLUMNS]
 
 
 def test_first_position_is_no_motion() -> None:
