@@ -57,7 +57,8 @@ def ball(
     Raises:
         canwall.errors.InputError: If the law or an option does not exist, or a value is out of
             range.
-        canwall.errors.RunFailedError: If the trajectory overflows.
+        canwall.errors.RunFailedError: If the law's force is not a number, or the trajectory or its
+            energy overflows.
     """
     dropped = Ball(
         stiffness=stiffness,

@@ -126,16 +126,21 @@ def simulate_ball(
 
     Raises:
         UnknownLawError: If the law or an option does not exist.
-        RunFailedError: If the trajectory overflows.
+        RunFailedError: If the law's force is not a number, or the trajectory or its energy
+            overflows.
     """
-    if law == CONTINUOUS:
-        trajectory = continuous_ball(ball)
-    else:
-        trajectory = sampled_ball(ball, find_law(law, deadbeat), options or {})
-    lost = ~np.isfinite(np.sum(trajectory, axis=0))
+    found = None if law == CONTINUOUS else find_law(law, deadbeat)
+    trajectory = sampled_ball(ball, found, options or {}) if found else continuous_ball(ball)
+    y, v, force = trajectory
+    with np.errstate(all="ignore"):  # what overflows is told below
+        lost = ~np.isfinite(np.sum(trajectory, axis=0) + ball.energy(y, v))
     if lost.any():
-        instant = float(lost.argmax()) * ball.period
-        raise RunFailedError(f"{law}: the trajectory overflows at t = {instant:g}")
+        j = int(lost.argmax())
+        what = "the trajectory overflows"
+        if found and math.isfinite(y[j]) and math.isnan(force[j]):
+            failure = found.failure()
+            what = f"raised {failure}" if failure else "gave a force that is not a number"
+        raise RunFailedError(f"{law}: {what} at t = {j * ball.period:g}")
     return trajectory
 
 
@@ -195,6 +200,9 @@ def bounce(walls: NDArray[np.void], address: int, y: float, v: float, trajectory
         trajectory[0, j] = y
         trajectory[1, j] = v
         trajectory[2, j] = force
+        if math.isnan(force):  # what the law's last call raised is asked for
+            trajectory[:, j + 1 :] = math.nan
+            return
         y_before = y
         y, v = free_step(wall, y, v, force)
     trajectory[0, periods] = y

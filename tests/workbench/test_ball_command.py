@@ -134,6 +134,25 @@ def test_option_of_a_law(bounce: Bounce) -> None:
     assert np.any(v > 0.0)
 
 
+@pytest.mark.parametrize(
+    ("inside", "line"),
+    [
+        ("raise ValueError('no')", "raised ValueError: no (mine.py, line 3) at t = 1.5"),
+        ("return math.nan", "gave a force that is not a number at t = 1.5"),
+        ("return math.inf", "the trajectory overflows at t = 1.5"),
+        # Only its energy does.
+        ("return 1e300", "the trajectory overflows at t = 1.6"),
+    ],
+)
+def test_law_without_a_usable_force(bounce: Bounce, inside: str, line: str) -> None:
+    text = f"def mine(wall):\n    if wall.y < 0.0:\n        {inside}\n    return 0.0\nimport math\n"
+    mine = bounce.file.with_name("mine.py")
+    mine.write_text(text)
+    said = bounce("--law", "mine.py:mine")
+    assert (said.code, said.err) == (1, f"canwall: {mine}:mine: {line}\n")
+    assert not bounce.file.exists()
+
+
 def test_no_periods(bounce: Bounce) -> None:
     assert bounce("--law", "two_step", "--periods", 0, "--height", 2).code == 0
     assert bounce.file.read_text() == "t,y,v,f\n0,2,0,0\n"
