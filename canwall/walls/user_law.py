@@ -49,6 +49,8 @@ def load_law(path: Path, function: str) -> Law:
             f"{where}: in a file the function stands without @canwall.law; options are the "
             "dictionary OPTIONS beside it"
         )
+    if isinstance(written, Dispatcher):
+        raise UnknownLawError(f"{where}: stands without numba's decorator; canwall compiles it")
     if not isinstance(written, FunctionType):
         raise UnknownLawError(f"{where}: the file has no such function")
     return make_law(where, written, getattr(module, "OPTIONS", {}))
@@ -162,6 +164,7 @@ def _check_types(compiled: Any) -> None:
                     f"number, on every way through it"
                 )
     _refuse_positions(annotation)
+    _refuse_changes(annotation)
 
 
 def _returned_type(block: Any, returned: Any, typemap: Mapping[str, Any]) -> Any:
@@ -208,6 +211,17 @@ def _refuse_positions(annotation: Any) -> None:
             for callee in kind.dispatcher.overloads.values():
                 if hasattr(callee.type_annotation, "blocks"):  # not if it was loaded from disk
                     _refuse_positions(callee.type_annotation)
+
+
+def _refuse_changes(annotation: Any) -> None:
+    """Refuse `wall.period = 1.0`, which would stay, and hold for the laws after it as well."""
+    for block in annotation.blocks.values():
+        for change in block.find_insts(ir.SetAttr):
+            if isinstance(annotation.typemap[change.target.name], types.Record):
+                raise UnsuitableLawError(
+                    f"line {change.loc.line}: changes {change.attr}; a law reads the wall, and "
+                    f"keeps numbers of its own in wall.memory"
+                )
 
 
 class _Guarded:

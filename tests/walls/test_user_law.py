@@ -163,6 +163,19 @@ def test_helpers_constants_memory_and_plain_integers(write: Write) -> None:
             "in a file the function stands without @canwall.law; options are the dictionary "
             "OPTIONS beside it",
         ),
+        (
+            "from numba import njit\n@njit\ndef mine(wall):\n    return 0.0\n",
+            "stands without numba's decorator; canwall compiles it",
+        ),
+        (
+            "def mine(wall):\n    wall.period = 1.0\n    return 0.0\n",
+            "line 2: changes period; a law reads the wall",
+        ),
+        (
+            "OPTIONS = {'growth': 1}\ndef mine(wall):\n    wall.options.growth += 1.0\n"
+            "    return 0.0\n",
+            "line 3: changes growth; a law reads the wall",
+        ),
         ("def mine(wall)\n    return 0.0\n", "SyntaxError: expected ':' (mine.py, line 1)"),
         ("import nowhere\n", "ModuleNotFoundError: No module named 'nowhere'"),
         ("def mine(wall):\n    pass\n", "line 2: returns None; a law returns a number"),
