@@ -79,6 +79,7 @@ def test_base_alone_runs(bare: dict[str, str], tmp_path: Path) -> None:
     [
         (["plot", "run"], "plot"),
         (["sweep", "--output", "x.nc"], "sweep"),
+        (["sweep", "--output", "x.nc", "--dask", "tcp://127.0.0.1:1"], "sweep,dask"),
         (["figures", "--output", "f"], "plot,sweep"),
         (["panel"], "panel"),
     ],

@@ -65,7 +65,7 @@ def sweep(
     """Sweep strikes over any axes and judge each wall, or search the K-limit at each point."""
     if workers is not None and dask is not None:
         raise InputError("--workers and --dask: keep one; a cluster has workers of its own")
-    need("sweep")
+    need("sweep", *(["dask"] if dask is not None else []))
     from canwall.config import absolute_law
 
     laws = [absolute_law(name, Path()) for name in law or []]
