@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from canwall.config import ConfigError, Settings
+from canwall.config import Settings
 from canwall.identify.estimates import UntellingDataError
 
 Array = NDArray[np.float64]
@@ -52,13 +52,13 @@ class Bounds:
     def of(cls, settings: Settings, position: float, torque_nm: float) -> "Bounds":
         """Return the bounds at a position, for a drive that gives at most `torque_nm`.
 
-        Raises ConfigError if the position is too near to a limit.
+        Raises UntellingDataError if the position is too near to a limit: the drive is enabled.
         """
         limits = settings.limits
         low, high = limits.position_rad
         room = min(position - low, high - position)
         if room <= 0.1 * (high - low):
-            raise ConfigError(
+            raise UntellingDataError(
                 f"limits.position_rad: the handle is at {position:.3g} rad, too near to a limit "
                 f"to be moved both ways; bring it to the middle of [{low:g}, {high:g}]"
             )
@@ -103,8 +103,7 @@ class Excitation:
             periods: Periods since the position before; 0: there is none since the last call.
 
         Raises:
-            UntellingDataError: If the handle is not where it should be.
-            ConfigError: If it has no room, at the start.
+            UntellingDataError: If the handle is not where it should be, or has no room.
         """
         if self._torques is None:
             self._position, self._start = position, position

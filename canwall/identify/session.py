@@ -123,7 +123,10 @@ class Identification:
         position, torque, actual = (np.array(column, float) for column in columns[:3])
         counts = np.array(columns[3], np.int64)
         if len(counts) < 2 or not np.any(np.diff(counts)):
-            raise UntellingDataError("the position did not change by a single count")
+            raise UntellingDataError(
+                "the position did not change by a single count: let the handle go, allow more "
+                "torque (limits.torque_nm), or look to the encoder"
+            )
         axis = self._axis
         step = encoder_step(counts) * float(axis.cycle["rad_per_count"][0])
         return Measured(position, torque, actual, counts, axis.settings.bus.cycle_s, step)

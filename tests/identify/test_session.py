@@ -13,7 +13,6 @@ from rig import eds_with, settings_with
 
 from canwall import config
 from canwall.config import Settings
-from canwall.errors import ConfigError
 from canwall.identify import UntellingDataError, identify
 from canwall.identify.excitation import Bounds, HandExcitation
 from canwall.identify.session import Identification, stiction
@@ -199,8 +198,15 @@ def test_master_that_stands_still_has_no_fast_handle(
 
 
 def test_handle_next_to_a_limit_is_refused() -> None:
-    with pytest.raises(ConfigError, match="too near to a limit"):
+    """Where the handle is shows once the drive is enabled: too late for bad input."""
+    with pytest.raises(UntellingDataError, match="too near to a limit"):
         Bounds.of(settings_with({}), 2.9, 1.9)
+
+
+def test_handle_that_does_not_move_is_told_what_to_do() -> None:
+    axis: Any = SimpleNamespace(cycle={"skipped_sync": np.zeros(1, int)})
+    with pytest.raises(UntellingDataError, match=r"single count: .*limits\.torque_nm"):
+        Identification(axis, cast(Any, None)).measured()
 
 
 def test_hand_excitation_is_small_and_ends() -> None:
