@@ -60,13 +60,14 @@ def make_axis(
         setup = set_up(
             node, settings.drive, settings.bus, settings.limits.torque_nm, settings.real_time
         )
+        period = settings.bus.cycle_s
+        changes = [WallStage(round(stage[0] / period), *stage[1:]) for stage in settings.stages[1:]]
+        # Within, as it loads compiled code for a second, in which Ctrl-C may come.
+        return WallAxis(node, setup, settings, laws, ring, changes)
     except BaseException as error:
         if settings.drive.restore:
             _tell(error, _restored(node))
         raise
-    period = settings.bus.cycle_s
-    changes = [WallStage(round(stage[0] / period), *stage[1:]) for stage in settings.stages[1:]]
-    return WallAxis(node, setup, settings, laws, ring, changes)
 
 
 def make_exchange(link: Link, axes: Sequence[WallAxis]) -> Exchange:

@@ -6,7 +6,10 @@ import pytest
 from canopen.objectdictionary import ODVariable
 from rig import Rig, RigFactory, settings_with
 
-from canwall.drive import DriveError
+from canwall.cycle import run_laws
+from canwall.drive import DriveError, DriveNode
+from canwall.record import Ring
+from canwall.run import make_axis
 
 READ_ONLY = 0x06010002
 COMMANDS = ((0x6040, 0), (0x6041, 0), (0x6071, 0))
@@ -42,6 +45,28 @@ def test_everything_is_as_before(make_rig: RigFactory) -> None:
     assert rig.node.restore() == []
     assert everything(rig) == before
     assert rig.node.restore() == []
+
+
+def test_interrupted_after_the_set_up(
+    make_rig: RigFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C while the compiled code of the wall is loaded."""
+    settings = settings_with({"drive.restore": True})
+    rig = make_rig(settings)
+    rig.rings.append(ring := Ring.create())
+    before = everything(rig)
+    during = []
+
+    def interrupted(node: DriveNode, *_: object) -> None:
+        rig.node = node
+        during.append(everything(rig))
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(make_axis.__globals__, "WallAxis", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        make_axis(rig.link, settings, rig.node.dictionary, run_laws(settings), ring)
+    assert before not in during
+    assert everything(rig) == before
 
 
 def test_what_cannot_be_put_back_is_said(make_rig: RigFactory) -> None:
