@@ -2,6 +2,7 @@
 
 import copy
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -365,6 +366,12 @@ keys = sorted(
     for section, field in Settings.model_fields.items()
     for key in getattr(field.annotation, "model_fields", {})
 )
+
+
+def test_every_key_is_explained() -> None:
+    text = shipped("config/sim.toml").read_text(encoding="utf-8")
+    missing = [key for key in keys if not re.search(rf"\b{key.partition('.')[2]}\b", text)]
+    assert missing == []
 
 
 @BOUNDED
