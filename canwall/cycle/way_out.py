@@ -80,13 +80,11 @@ def run_loop(
     supervisor = _Supervisor(loop)
     # A collection would stop the cycle for milliseconds; the loop creates no reference cycles.
     gc.collect()
-    gc.freeze()
     gc.disable()
     try:
         supervisor.supervise(work, prepared or nullcontext({}), outcome)
     finally:
         gc.enable()
-        gc.unfreeze()
         outcome.cycles = loop.j
     error = outcome.error or supervisor.interruption
     if error is not None:
