@@ -249,8 +249,10 @@ def load() -> None:
     import canwall.sweep
     import canwall.workbench
     from canwall import config
+    from canwall.record.pictures import warm_up
     from canwall.run import run
 
+    warm_up()
     forking = types.SimpleNamespace(**{**vars(subprocess), "Popen": PopenByFork})
     canwall.record.recorder.subprocess = forking  # type: ignore[attr-defined]
     for exchange in ("python-can", "native"):

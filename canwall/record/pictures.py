@@ -1,6 +1,7 @@
 """Picture of a run, drawn from its record alone."""
 
 import io
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -101,8 +102,9 @@ def run_figure(signals: "pa.Table", strikes: list[dict[str, Any]]) -> Figure:
     return figure
 
 
+@cache
 def warm_up() -> None:
-    """Draw an empty run into memory: what a first picture takes longer is loaded then."""
+    """Draw an empty run into memory, once: what a first picture takes longer is loaded then."""
     import pyarrow as pa
 
     nothing = pa.table({name: np.zeros(2) for name in DRAWN})
