@@ -120,6 +120,8 @@ class Rig:
         self.native = native
         self.settings = settings or settings_with()
         assert self.settings.simulation is not None
+        if self.settings.real_time:
+            simdrive.load_compiled_code(real_time=True)
         channel = f"rig {next(_channels)}"
         self.bus: can.BusABC
         self.drive_bus: can.BusABC
