@@ -121,7 +121,7 @@ class Rig:
         self.settings = settings or settings_with()
         assert self.settings.simulation is not None
         if self.settings.real_time:
-            simdrive.load_compiled_code(real_time=True)
+            simdrive.load_compiled_code(self.settings.simulation.real_time)
         channel = f"rig {next(_channels)}"
         self.bus: can.BusABC
         self.drive_bus: can.BusABC

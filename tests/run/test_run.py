@@ -41,13 +41,13 @@ from rig import (
     settings_with,
 )
 
-from canwall import config
+from canwall import config, simdrive
 from canwall.cycle import make_cycle, run_laws, set_wall, step
 from canwall.cycle.state import start_at
 from canwall.drive import DriveSetup, Field, PdoLayout
 from canwall.errors import RunFailedError
 from canwall.record import ROW, Phase, Recorder
-from canwall.run import buses, run
+from canwall.run import buses, on_the_bus, run
 from canwall.units import DriveUnits
 
 UNIXCAN_CONFIG = config.shipped("config/unixcan.toml")
@@ -457,3 +457,13 @@ def test_record_that_is_lost(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) ->
     settings = settings_with({"run.duration_s": 0.3})
     with pytest.raises(RunFailedError, match="the writer of the record has died"):
         run(settings, tmp_path / "run", progress=lambda now, end: recorders[0]._writer.kill())
+
+
+@pytest.mark.parametrize(("pace", "loads"), [("real_time", [False]), ("simulated", [])])
+def test_drive_is_loaded_before_the_clock_counts(
+    monkeypatch: pytest.MonkeyPatch, pace: str, loads: list[bool]
+) -> None:
+    loaded: list[bool] = []
+    monkeypatch.setattr(simdrive, "load_compiled_code", loaded.append)
+    with on_the_bus(settings_with({"bus.pace": pace})):
+        assert loaded == loads
