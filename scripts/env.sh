@@ -26,8 +26,9 @@ set_up_environment() {
     if ! [ -x "$bin/python" ] || ! "$bin/python" -c '' 2>/dev/null || ! grep -qsF "$root" "$root"/.venv/installed*; then
       "$python" -m venv --clear "$root/.venv"
     fi
-    "$bin/python" -m pip install --quiet --disable-pip-version-check --constraint "$constraints" \
-      --editable "$root$1" >&2
+    # Compiled as it is imported: most of it never is, and compiling all takes as long as the rest.
+    "$bin/python" -m pip install --quiet --disable-pip-version-check --no-compile \
+      --constraint "$constraints" --editable "$root$1" >&2
     printf '%s' "$state" >"$root/.venv/installed$1"
   ) 9>"$root/.venv.lock"
 }
