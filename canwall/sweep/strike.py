@@ -12,7 +12,7 @@ from canwall.analysis.felt import HANDLE_RADIUS_M, FeltBand, felt_band, handle_r
 from canwall.analysis.strike import MEASURES, keeps_limits, measure_strike
 from canwall.compiled import Record, compiled
 from canwall.config import ConfigError, Hand, Mechanics, Settings, Simulation
-from canwall.cycle import named_law, run_laws, stiffest_for
+from canwall.cycle import Trip, named_law, run_laws, stiffest_for
 from canwall.errors import InputError, RunFailedError
 from canwall.record import ROW, Phase, Ring
 from canwall.run import drive_dictionary, make_axis, make_exchange, on_the_bus, render
@@ -327,6 +327,9 @@ class PreparedStrike:
 
         Returns:
             Measures of each strike, shape (n,), dtype MEASURES.
+
+        Raises:
+            RunFailedError: If the law raises.
         """
         measures = np.zeros(len(walls), MEASURES)
         if self._by_frames:
@@ -346,7 +349,21 @@ class PreparedStrike:
                 np.zeros(1, ROW),
                 measures,
             )
+        for wall in walls[measures["trip"] == Trip.NOT_A_NUMBER][:1]:
+            self._refuse_what_raises(*wall.tolist())
         return measures
+
+    def _refuse_what_raises(self, stiffness: float, damping: float) -> None:
+        """Raise RunFailedError if the law has raised on this wall: that is no limit of it."""
+        simulate_wall(
+            self._loop, stiffness, damping, np.zeros(1, ROW), np.empty((SIGNALS, self._cycles))
+        )
+        law = run_laws(self._settings)[0]
+        if failure := law.failure(self._loop.cycle["rendered"]["wall"].reshape(1)):
+            raise RunFailedError(
+                f"{_shown(stiffness, damping)}: cycle {self.progress}: law {law.name} raised "
+                f"{failure}"
+            )
 
     def motion(self, stiffness: float, damping: float) -> StrikeMotion:
         """Strike a wall of this stiffness [N·m/rad] and damping [N·m·s/rad], in memory."""

@@ -116,7 +116,8 @@ class Law:
         name: Name in configurations and summaries.
         options: Names and defaults of what `[wall.options]` may set.
         sampled: True if it goes by the sampled position, not by the state that a model gives.
-        failure: Returns what the last call raised, empty if nothing.
+        failure: Returns what a call with this wall, dtype WALL and shape (1,), raises, or without
+            one what the last call has raised; empty if nothing.
     """
 
     def __init__(
@@ -125,7 +126,7 @@ class Law:
         function: Callable[[Any], float],
         options: Mapping[str, float],
         cached: bool = True,
-        failure: Callable[[], str] = lambda: "",
+        failure: Callable[[NDArray[np.void] | None], str] = lambda wall: "",
         sampled: bool = False,
     ) -> None:
         """Declare a law; nothing is compiled yet.

@@ -25,6 +25,7 @@ from numba.core import cgutils, ir
 from numba.core.dispatcher import Dispatcher
 from numba.core.errors import NumbaError
 from numba.extending import intrinsic
+from numpy.typing import NDArray
 
 from canwall.errors import did_you_mean
 from canwall.walls.interface import MAX_OPTIONS, Law, UnknownLawError, wall_with
@@ -256,15 +257,16 @@ class _Guarded:
 
         return guarded
 
-    def failure(self) -> str:
-        """Return type, message and line of what the last call raised, empty if it did not."""
+    def failure(self, wall: NDArray[np.void] | None) -> str:
+        """Return type, message and line of what a call raises, see `Law`; empty if it does not."""
+        kept = self._kept if wall is None else np.ascontiguousarray(wall).view(self._kept.dtype)
         try:
-            self._compiled(self._kept.copy()[0])
+            self._compiled(kept.copy()[0])
         except Exception as error:
-            return f"{type(error).__name__}: {_gist(error)}{self._place(error)}"
+            return f"{type(error).__name__}: {_gist(error)}{self._place(error, kept)}"
         return ""
 
-    def _place(self, error: Exception) -> str:
+    def _place(self, error: Exception, kept: NDArray[np.void]) -> str:
         """Return file and line of an exception, as the end of a message.
 
         Compiled code knows them for a `raise`; for the others the function is interpreted.
@@ -272,7 +274,7 @@ class _Guarded:
         interpreted: Exception | None = None
         try:
             with np.errstate(all="raise"):
-                self._written(self._kept.copy().view(np.recarray)[0])
+                self._written(kept.copy().view(np.recarray)[0])
         except Exception as repeated:
             interpreted = repeated
         for candidate in (error, interpreted):

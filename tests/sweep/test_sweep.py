@@ -4,6 +4,7 @@ import contextlib
 import errno
 import json
 import os
+import re
 import signal
 import socket
 import sqlite3
@@ -497,6 +498,31 @@ def test_a_worker_that_dies_is_one_line(tmp_path: Path) -> None:
     assert sweeping.returncode == 1
     line = f"a process that computes the sweep has died; --resume continues {tmp_path}/a.nc"
     assert errors == f"canwall: {line}\n"
+
+
+RAISING = """def raising(wall):
+    if wall.y < 0.0 and wall.stiffness > 50.0:
+        raise ValueError("too stiff")
+    return -wall.stiffness * min(wall.y, 0.0)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stiffness", [["--stiffness", "20,60,70"], []])
+def test_a_law_that_raises_is_named_with_its_wall(tmp_path: Path, stiffness: list[str]) -> None:
+    """To raise is no limit of its stiffness."""
+    law = tmp_path / "laws.py"
+    law.write_text(RAISING)
+    done = command(
+        *("sweep", settings_file(), "--output", tmp_path / "a.nc", "--law", f"{law}:raising"),
+        *("--axis", "speed=1", "--axis", "phase=0", *stiffness),
+    )
+    assert done.returncode == 1
+    assert re.fullmatch(
+        r"canwall: .*stiffness [5-9]\d[\d.]*, damping 0: cycle \d+: law \S+laws.py:raising raised "
+        r"ValueError: too stiff \(laws.py, line 3\); --resume continues \S+\n",
+        done.stderr,
+    )
 
 
 HANGING = """def hanging(wall):
