@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 from commands import COMMAND, PATIENCE_S, Record, config_file, torque_is_on, wait_for
+from fork_server import ForkedPopen
 from hypothesis import example, given
 from hypothesis import strategies as st
 from rig import SIM_CONFIG, eds_with
@@ -51,7 +52,7 @@ class Person:
         self.folder = folder
         config = config or config_file(folder.parent / "sim.toml", PATIENT)
         options = ["--output", folder, *map(str, arguments)]
-        self.process = subprocess.Popen(
+        self.process = ForkedPopen[str](
             [COMMAND, "study", study, config, *options],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
