@@ -15,6 +15,7 @@ import re
 import sys
 import traceback
 from collections.abc import Callable, Mapping
+from numbers import Real
 from pathlib import Path
 from types import FunctionType
 from typing import Any
@@ -96,13 +97,10 @@ class UnsuitableLawError(Exception):
 
 
 def _declared_options(law: str, options: object) -> Mapping[str, float]:
-    if not (
-        isinstance(options, dict)
-        and all(isinstance(n, str) and isinstance(v, int | float) for n, v in options.items())
-    ):
+    if not isinstance(options, dict) or not all(isinstance(name, str) for name in options):
         raise UnknownLawError(f"{law}: OPTIONS has to be a dictionary of names and numbers")
     for name, value in options.items():
-        if not abs(value) <= sys.float_info.max:
+        if not isinstance(value, Real) or not abs(value) <= sys.float_info.max:
             raise UnknownLawError(f"{law}: OPTIONS: {name} has to be a finite number")
     for name in options:
         if not name.isidentifier() or keyword.iskeyword(name):
@@ -111,7 +109,7 @@ def _declared_options(law: str, options: object) -> Mapping[str, float]:
             )
     if len(options) > MAX_OPTIONS:
         raise UnknownLawError(f"{law}: {len(options)} options; a law may have up to {MAX_OPTIONS}")
-    return options
+    return {name: float(value) for name, value in options.items()}
 
 
 def _unknown_field(name: str, options: Mapping[str, float]) -> str:
@@ -155,6 +153,9 @@ def _line_in(path: Path, message: str) -> str:
 def _check_types(compiled: Any) -> None:
     """Raise UnsuitableLawError for a value that is no force, or an option read by its position."""
     annotation = compiled.type_annotation
+    ends = [block.terminator for block in annotation.blocks.values()]
+    if not any(isinstance(end, ir.Return) for end in ends):
+        raise UnsuitableLawError("returns on no way through it; a law returns a number")
     for block in annotation.blocks.values():
         returned = block.terminator
         if isinstance(returned, ir.Return):

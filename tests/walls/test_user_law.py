@@ -152,6 +152,16 @@ def test_helpers_constants_memory_and_plain_integers(write: Write) -> None:
     np.testing.assert_allclose(force[:-1], expected, rtol=1e-12, atol=0.0)
 
 
+def test_options_may_be_numbers_of_numpy(write: Write) -> None:
+    law = write(
+        "import numpy as np\n"
+        "OPTIONS = {'a': np.int64(2), 'b': np.float32(0.5)}\n"
+        "def mine(wall):\n    return wall.options.a * wall.options.b\n"
+    )
+    _, _, force = simulate_ball(Ball(periods=3), law)
+    assert force[:-1].tolist() == [1.0, 1.0, 1.0]
+
+
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
@@ -179,6 +189,7 @@ def test_helpers_constants_memory_and_plain_integers(write: Write) -> None:
         ("def mine(wall)\n    return 0.0\n", "SyntaxError: expected ':' (mine.py, line 1)"),
         ("import nowhere\n", "ModuleNotFoundError: No module named 'nowhere'"),
         ("def mine(wall):\n    pass\n", "line 2: returns None; a law returns a number"),
+        ("def mine(wall):\n    raise ValueError\n", "returns on no way through it; a law returns"),
         (
             "def mine(wall):\n    if wall.y < 0.0:\n        return 1.0\n",
             "line 2: returns None; a law returns a number, on every way through it",
@@ -220,7 +231,10 @@ def test_helpers_constants_memory_and_plain_integers(write: Write) -> None:
         ("def mine(wall, y):\n    return y\n", "takes 2 arguments; a law takes one, the wall"),
         ("import math\nmath.nowhere\n", "AttributeError: module 'math' has no attribute 'nowhere'"),
         ("OPTIONS = ['a']\ndef mine(wall):\n    return 0.0\n", "OPTIONS "),
-        ("OPTIONS = {'a': 'b'}\ndef mine(wall):\n    return 0.0\n", "OPTIONS "),
+        (
+            "OPTIONS = {'a': 'b'}\ndef mine(wall):\n    return 0.0\n",
+            "OPTIONS: a has to be a finite",
+        ),
         *(
             (f"OPTIONS = {{'a': {value}}}\ndef mine(wall):\n    return 0.0\n", "OPTIONS: a has to")
             for value in ("float('nan')", "-1e999", "10**400")
