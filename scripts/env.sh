@@ -26,11 +26,15 @@ set_up_environment() {
     if ! [ -x "$bin/python" ] || ! "$bin/python" -c '' 2>/dev/null || ! grep -qsF "$root" "$root"/.venv/installed*; then
       "$python" -m venv --clear "$root/.venv"
     fi
-    # Compiled as it is imported: most of it never is, and compiling all takes as long as the rest.
-    "$bin/python" -m pip install --quiet --disable-pip-version-check --no-compile \
-      --constraint "$constraints" --editable "$root$1" >&2
+    # uv does in seconds what takes pip a minute, but does not know where pip is told to look.
+    { pip_install uv && "$bin/uv" pip install --python "$bin/python" --constraint "$constraints" \
+      --editable "$root$1"; } >/dev/null 2>&1 || pip_install --editable "$root$1" >&2
     printf '%s' "$state" >"$root/.venv/installed$1"
   ) 9>"$root/.venv.lock"
+}
+
+pip_install() {
+  "$bin/python" -m pip install --quiet --disable-pip-version-check --constraint "$constraints" "$@"
 }
 
 as_root() {

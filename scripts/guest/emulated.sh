@@ -30,8 +30,13 @@ run_over_socket() {
   eds=$(printf '%s' "$root/eds" | sed 's/[#&\]/\\&/g')
   sed "s#/tmp/canwall.sock#$work/can.sock#; s#\.\./eds#$eds#; s/^\[bus\]/&\nexchange = \"$1\"/" \
     "$root/config/unixcan.toml" >"$work/$1.toml"
+  rm -f "$work/can.sock"
   "$bin/canwall" drive "$work/$1.toml" >/dev/null &
   drive=$!
+  # The drive has to be first: who opens the socket passes the frames on, in Python.
+  while ! [ -S "$work/can.sock" ] && kill -0 "$drive" 2>/dev/null; do
+    sleep 0.1
+  done
   status=0
   "$bin/canwall" run "$work/$1.toml" --duration 0.5 --output "$work/$1" >/dev/null || status=$?
   kill "$drive"
