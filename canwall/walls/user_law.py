@@ -15,7 +15,6 @@ import re
 import sys
 import traceback
 from collections.abc import Callable, Mapping
-from numbers import Real
 from pathlib import Path
 from types import FunctionType
 from typing import Any
@@ -100,7 +99,8 @@ def _declared_options(law: str, options: object) -> Mapping[str, float]:
     if not isinstance(options, dict) or not all(isinstance(name, str) for name in options):
         raise UnknownLawError(f"{law}: OPTIONS has to be a dictionary of names and numbers")
     for name, value in options.items():
-        if not isinstance(value, Real) or not abs(value) <= sys.float_info.max:
+        number = value.item() if isinstance(value, np.generic) else value
+        if not isinstance(number, int | float) or not abs(number) <= sys.float_info.max:
             raise UnknownLawError(f"{law}: OPTIONS: {name} has to be a finite number")
     for name in options:
         if not name.isidentifier() or keyword.iskeyword(name):
