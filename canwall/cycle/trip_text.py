@@ -83,7 +83,7 @@ def _failed_law(axis: WallAxis) -> str:
     """Describe what went wrong in the law, or in the one before while they are blended."""
     present, before = (int(axis.cycle[wall]["law"][0, 0]) for wall in ("rendered", "faded"))
     for law in (axis.laws[i] for i in (present, before) if i >= 0):
-        if failure := law.failure(None):
+        if failure := law.failure():
             return f"law {law.name} raised {failure}"
     return f"law {axis.laws[present].name} gave a force that is not a number"
 

@@ -42,6 +42,9 @@ def make_simulated_drive(
     """
     if settings.simulation is None:
         raise ConfigError("[simulation] is missing: there is no drive to simulate")
+    if settings.real_time:
+        # Loaded at its first SYNC, it would keep a master of this process from the next ones.
+        simdrive.load_compiled_code(settings.simulation.real_time)
     bus = settings.bus
     return simdrive.make_drive(
         settings.drive, settings.simulation, bus.cycle_s, bus.bitrate, report
@@ -78,10 +81,6 @@ def _open_link(stack: ExitStack, many: Sequence[Settings]) -> Link:
         refuse_second_master(link, bus, [settings.drive.node_id for settings in many])
         return link
     drives = [make_simulated_drive(settings) for settings in many]
-    for settings in many:
-        # Loaded at its first SYNC, it would keep the master of this process from the next ones.
-        if settings.real_time and settings.simulation is not None:
-            simdrive.load_compiled_code(settings.simulation.real_time)
     if len(many) == 1 and _is_alone(many[0]):
         master, slave = (stack.enter_context(end) for end in socket_pair(bus.channel))
         compile_beside("canwall.cycle.sockets", "compile_run")  # the drive is compiled here

@@ -355,9 +355,7 @@ class PreparedStrike:
 
     def _refuse_what_raises(self, stiffness: float, damping: float) -> None:
         """Raise RunFailedError if the law has raised on this wall: that is no limit of it."""
-        simulate_wall(
-            self._loop, stiffness, damping, np.zeros(1, ROW), np.empty((SIGNALS, self._cycles))
-        )
+        self._repeat(stiffness, damping)
         law = run_laws(self._settings)[0]
         if failure := law.failure(self._loop.cycle["rendered"]["wall"].reshape(1)):
             raise RunFailedError(
@@ -419,15 +417,19 @@ class PreparedStrike:
 
         They are those of the loop in memory, as long as it commands the same torques; NaN after.
         """
-        again = np.empty((SIGNALS, self._cycles))
-        done = simulate_wall(self._loop, stiffness, damping, np.zeros(1, ROW), again)
-        again = again[:, self._loop.enabling : done]
+        again = self._repeat(stiffness, damping)
         shared = min(len(torque), again.shape[1])
         differs = np.flatnonzero(torque[:shared] != again[2, :shared])
         felt = np.full(len(torque), np.nan)
         same = differs[0] if len(differs) else shared
         felt[:same] = again[3, :same]
         return felt
+
+    def _repeat(self, stiffness: float, damping: float) -> Array:
+        """Strike a wall in memory; return the signals from the end of enabling on."""
+        signals = np.empty((SIGNALS, self._cycles))
+        done = simulate_wall(self._loop, stiffness, damping, np.zeros(1, ROW), signals)
+        return signals[:, self._loop.enabling : done]
 
 
 def _shown(stiffness: float, damping: float) -> str:

@@ -116,8 +116,8 @@ class Law:
         name: Name in configurations and summaries.
         options: Names and defaults of what `[wall.options]` may set.
         sampled: True if it goes by the sampled position, not by the state that a model gives.
-        failure: Returns what a call with this wall, dtype WALL and shape (1,), raises, or without
-            one what the last call has raised; empty if nothing.
+        failure: Returns what the last call raised, or what one with a given wall raises, dtype WALL
+            and shape (1,); empty if nothing.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class Law:
         function: Callable[[Any], float],
         options: Mapping[str, float],
         cached: bool = True,
-        failure: Callable[[NDArray[np.void] | None], str] = lambda wall: "",
+        failure: Callable[..., str] = lambda wall=None: "",
         sampled: bool = False,
     ) -> None:
         """Declare a law; nothing is compiled yet.

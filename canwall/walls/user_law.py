@@ -153,18 +153,17 @@ def _line_in(path: Path, message: str) -> str:
 def _check_types(compiled: Any) -> None:
     """Raise UnsuitableLawError for a value that is no force, or an option read by its position."""
     annotation = compiled.type_annotation
-    ends = [block.terminator for block in annotation.blocks.values()]
-    if not any(isinstance(end, ir.Return) for end in ends):
+    blocks = annotation.blocks.values()
+    returning = [block for block in blocks if isinstance(block.terminator, ir.Return)]
+    if not returning:
         raise UnsuitableLawError("returns on no way through it; a law returns a number")
-    for block in annotation.blocks.values():
-        returned = block.terminator
-        if isinstance(returned, ir.Return):
-            kind = _returned_type(block, returned, annotation.typemap)
-            if not isinstance(kind, types.Number | types.Boolean) or kind in types.complex_domain:
-                raise UnsuitableLawError(
-                    f"line {returned.loc.line}: returns {_shown_type(kind)}; a law returns a "
-                    f"number, on every way through it"
-                )
+    for block in returning:
+        kind = _returned_type(block, block.terminator, annotation.typemap)
+        if not isinstance(kind, types.Number | types.Boolean) or kind in types.complex_domain:
+            raise UnsuitableLawError(
+                f"line {block.terminator.loc.line}: returns {_shown_type(kind)}; a law returns a "
+                f"number, on every way through it"
+            )
     _refuse_positions(annotation)
     _refuse_changes(annotation)
 
@@ -258,7 +257,7 @@ class _Guarded:
 
         return guarded
 
-    def failure(self, wall: NDArray[np.void] | None) -> str:
+    def failure(self, wall: NDArray[np.void] | None = None) -> str:
         """Return type, message and line of what a call raises, see `Law`; empty if it does not."""
         kept = self._kept if wall is None else np.ascontiguousarray(wall).view(self._kept.dtype)
         try:

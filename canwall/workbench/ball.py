@@ -138,7 +138,7 @@ def simulate_ball(
         j = int(lost.argmax())
         what = "the trajectory overflows"
         if found and math.isfinite(y[j]) and math.isnan(force[j]):
-            failure = found.failure(None)
+            failure = found.failure()
             what = f"raised {failure}" if failure else "gave a force that is not a number"
         raise RunFailedError(f"{law}: {what} at t = {j * ball.period:g}")
     return trajectory

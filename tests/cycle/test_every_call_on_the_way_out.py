@@ -5,7 +5,6 @@ to its end, and each place that calls a function there gets each kind of fault o
 place of the ways out that a failed cycle, a deaf drive and a hanging cycle take.
 """
 
-import gc
 import signal
 import sys
 import threading
@@ -189,7 +188,6 @@ def test_fault_at_every_call(make_rig: RigFactory, kind: str, way: str) -> None:
         released = threading.Event()
         happens = kinds()[kind] if kind != "hang" else lambda released=released: released.wait(60)
         fault, outcome = Fault(place, happens), Outcome()
-        gc.freeze()  # each run has the collector look at what is not
         try:
             rig = tried(fault, outcome, way)
             said = [*outcome.trips, *outcome.notes]

@@ -246,7 +246,7 @@ def test_rows_of_another_kind_are_no_record(four_strikes: Record, tmp_path: Path
     signals = four_strikes.signals
     column = signals.column_names.index("y")
     text = pa.array(["deep"] * signals.num_rows)
-    pa.parquet.write_table(signals.set_column(column, "y", text), folder.signals)
+    pq.write_table(signals.set_column(column, "y", text), folder.signals)
     with pytest.raises(ConfigError, match="column y holds string, not double"):
         read_run(folder)
 
@@ -256,7 +256,7 @@ def test_record_without_rows_is_told_beside_a_summary_as_well(
 ) -> None:
     folder = copy_of(four_strikes.folder, tmp_path / "run", "config.toml", "summary.json")
     signals = four_strikes.signals
-    pa.parquet.write_table(signals.slice(0, 0), folder.signals)
+    pq.write_table(signals.slice(0, 0), folder.signals)
     with pytest.raises(ConfigError, match="no cycle was recorded"):
         read_run(folder)
 

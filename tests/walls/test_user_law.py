@@ -334,17 +334,17 @@ def test_exception_in_a_law_is_a_nan_force_and_is_told(
     bench["stiffness"] = 50.0
     bench["y"] = 0.1
     assert wall_force(found.address, bench[0]) == 0.25
-    assert found.failure(None) == ""
+    assert found.failure() == ""
     bench["y"] = -0.1
     assert not np.isfinite(wall_force(found.address, bench[0]))
     # The exception of that call, although the law would not raise it in the state that it left.
     for _ in range(2):
-        assert found.failure(None) == f"{raised} (raises.py, line 4)"
+        assert found.failure() == f"{raised} (raises.py, line 4)"
     assert wall_force(found.address, bench[0]) == 0.25
-    assert found.failure(None) == ""
+    assert found.failure() == ""
 
 
 def test_force_that_is_no_number_is_no_exception(write: Write) -> None:
     found = find_law(write("import math\ndef mine(wall):\n    return math.nan\n"))
     assert not np.isfinite(wall_force(found.address, np.zeros(1, WALL)[0]))
-    assert found.failure(None) == ""
+    assert found.failure() == ""
