@@ -87,21 +87,28 @@ BANK = np.dtype(
         ("presses", "?"),
         # Gains, `with_velocity` and `equal_samples` for softer and softer walls, each half as stiff
         # as the one before, and for a handle that moves, as parabolas over the bandwidth relative
-        # to that for the delay as told; stiffness of the first, number of the one in force, and
-        # that relative bandwidth.
+        # to that for the delay as told; stiffness of the first, numbers of those in force, of
+        # filters whose noise is felt and of the others, and that relative bandwidth.
         ("paces", "f8", (len(QUICKER), PACES + 1, 6, MAX_FILTERS)),
         ("steadiest", "f8"),
         ("pace", "i8"),
+        ("light_pace", "i8"),
         ("quicker", "f8"),
-        # Samples for which a handle that moved is followed quickly, and those that are left.
+        # Samples since the handle moved, the number of those for which filters whose noise is felt
+        # follow it quickly, and the number from which on it is calm, up to which others do.
+        ("moved", "i8"),
         ("lively", "i8"),
-        ("lively_left", "i8"),
+        ("calm", "i8"),
         # What a correction of the velocity says of position and force, and the number of equal
         # samples from which on there is one.
         ("with_velocity", "f8", (2, MAX_FILTERS)),
         ("equal_samples", "f8", (MAX_FILTERS,)),
-        # Of what a sample differs from the prediction, the part that contradicts nothing.
+        # Of what a sample differs from the prediction, the part that contradicts nothing, and the
+        # part beyond which the gain is another one: on the way to the quickest one by this share.
         ("within", "f8", (MAX_FILTERS,)),
+        ("far", "f8"),
+        ("far_gain", "f8", (3, MAX_FILTERS)),
+        ("far_share", "f8", (MAX_FILTERS,)),
         ("sampled", "f8"),
         ("equal", "i8"),  # samples in a row up to now
         # Over a period: Φ row by row, and the effects on (y, ẏ) of the older force, which acts up
@@ -146,9 +153,10 @@ _FORGOTTEN_S = 0.2
 #: Share of the way to the likeliest mass that is gone in a period.
 _FOLLOWED = 0.6
 #: Least speed of a handle that moves [rad/s], and the time after it for which filters are as quick
-#: as they may be [s]: noise is felt at rest alone, and a filter that is slow to find the push after
-#: a blow makes a heavy hand bounce.
-_MOVES, _LIVELY_S = 0.28, 0.2
+#: as they may be, if their noise is felt and if not [s]: noise is felt at rest alone, and a filter
+#: that is slow to find the push after a blow makes a heavy hand bounce. After the latter time the
+#: handle is calm.
+_MOVES, _LIVELY_S, _CALM_S = 0.28, 0.05, 0.2
 #: Time without torque but a probe's after which a handle that moves flies, and time constant with
 #: which the trend of the push is forgotten in contact [s]: what a blow and the push after it do to
 #: an estimate is no trend.
@@ -210,7 +218,8 @@ def set_bank(
     bank["log_lightest"] = math.log(masses[0])
     bank["log_step"] = math.log(masses[-1] / masses[0]) / (n - 1) if n > 1 else 0.0
     bank["spring"] = spring
-    bank["forgotten"], bank["lively"] = round(_FORGOTTEN_S / period), round(_LIVELY_S / period)
+    bank["forgotten"] = round(_FORGOTTEN_S / period)
+    bank["lively"], bank["calm"] = round(_LIVELY_S / period), round(_CALM_S / period)
     bank["flight"], bank["trend_left"] = round(_FLIGHT_S / period), math.exp(-period / _TREND_S)
     bank["landing"] = round(_LANDING_S / period)
     told = delay - margin
@@ -221,7 +230,7 @@ def set_bank(
     set_regression(bank["regression"][0, 0], lightest, period, count, told, shaft)
     slower = 1 if shaft is None else OBSERVER_SLOWER_BEHIND_SHAFT
     set_probe(bank["probe"][0, 0], lightest, period, count, slower)
-    bank["stiffest"], bank["within"] = np.inf, 0.0
+    bank["stiffest"], bank["within"], bank["far_share"] = np.inf, 0.0, 0.0
     bank["gain_in_flight"] = bank["trend_gain"] = 0.0
     bank["steadiest"] = STEADIEST * masses[-1] / period**2
     bank["viscous"][0, :n] = viscous
@@ -242,9 +251,10 @@ def reset_bank(bank: NDArray[np.void], y: float) -> None:
     bank["place"], bank["spread"], bank["known"] = 0.0, 0.0, False
     bank["mass"] = np.exp(bank["log_lightest"])
     bank["at_rest"] = 0
-    bank["sampled"], bank["equal"], bank["lively_left"] = y, 0, 0
+    bank["sampled"], bank["equal"], bank["moved"] = y, 0, bank["calm"]
     # None of either: the first cycle sets what depends on them.
-    bank["delay_in_force"], bank["pace"], bank["age"] = -1.0, -1, 0.0
+    bank["delay_in_force"], bank["age"] = -1.0, 0.0
+    bank["pace"] = bank["light_pace"] = -1
     bank["quicker"] = 1.0
 
 
@@ -273,12 +283,13 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
         if bank.flies and bank.gain_in_flight[0, i] > 0.0:
             _correct_in_flight(bank, i, residual)
             continue
-        residual -= min(max(residual, -bank.within[i]), bank.within[i])
-        state[0, i] += gain[0, i] * residual
-        state[1, i] += gain[1, i] * residual
-        state[2, i] += gain[2, i] * residual
+        far = residual - min(max(residual, -bank.far), bank.far)
+        near = residual - far
+        near -= min(max(near, -bank.within[i]), bank.within[i])
+        for c in range(3):
+            state[c, i] += gain[c, i] * near + bank.far_gain[c, i] * far
         if follows:
-            _follow_trend(bank, i, bank.trend_gain[i] * gain[2, i] * residual)
+            _follow_trend(bank, i, bank.trend_gain[i] * gain[2, i] * (near + far))
     _bound_velocity(bank, y_sample)
     changed = _identify(bank, estimator, y_sample)
     changed |= _follow_delay(bank, estimator)
@@ -338,33 +349,44 @@ def set_pace(bank: Record, stiffness: float) -> None:
     """Make the filters as quick as handle and stiffness want; call before `correct_bank`."""
     regression = bank.regression[0]
     if abs(regression.way) >= _MOVES * regression.period:
-        bank.lively_left = bank.lively
-    elif bank.lively_left > 0:
-        bank.lively_left -= 1
-    pace = PACES - 1
-    if bank.lively_left > 0:
-        pace = PACES
-    elif stiffness > 0.0:
-        pace = min(max(int(math.log2(bank.steadiest / stiffness)), 0), pace)
+        bank.moved = 0
+    else:
+        bank.moved = min(bank.moved + 1, bank.calm)
+    resting = PACES - 1
+    if stiffness > 0.0:
+        resting = min(max(int(math.log2(bank.steadiest / stiffness)), 0), resting)
+    felt = PACES if _is_lively(bank) else resting
+    light = PACES if bank.moved < bank.calm else resting
     quicker = bank.quicker
     if bank.delay_in_force >= 0.0:
         quicker = max(bank.delay, SHORTEST_DELAY) / max(bank.delay_in_force, SHORTEST_DELAY)
         quicker = min(max(quicker, QUICKER[0]), QUICKER[2])
-    if pace == bank.pace and abs(quicker - bank.quicker) < _WORTH:
+    same = felt == bank.pace and light == bank.light_pace
+    if same and abs(quicker - bank.quicker) < _WORTH:
         return
-    bank.pace, bank.quicker = pace, quicker
+    bank.pace, bank.light_pace, bank.quicker = felt, light, quicker
     for i in range(bank.count):
+        pace = felt if bank.far_share[i] > 0.0 else light
         for c in range(3):
-            bank.gain[c, i] = _paced(bank, c, i)
-        bank.with_velocity[0, i], bank.with_velocity[1, i] = _paced(bank, 3, i), _paced(bank, 4, i)
-        equal_samples = _paced(bank, 5, i)
+            own, quickest = _paced(bank, pace, c, i), _paced(bank, PACES, c, i)
+            bank.gain[c, i] = own
+            bank.far_gain[c, i] = own + bank.far_share[i] * (quickest - own)
+        bank.with_velocity[0, i] = _paced(bank, pace, 3, i)
+        bank.with_velocity[1, i] = _paced(bank, pace, 4, i)
+        equal_samples = _paced(bank, pace, 5, i)
         bank.equal_samples[i] = equal_samples if equal_samples <= _EQUAL_SAMPLES else math.inf
 
 
 @compiled
-def _paced(bank: Record, quantity: int, i: int) -> float:
-    """Return a quantity of filter i for the pace in force."""
-    c, pace, x = bank.paces, bank.pace, bank.quicker
+def _is_lively(bank: Record) -> bool:
+    """Return True while even filters whose noise is felt are as quick as they may be."""
+    return bank.moved < bank.lively
+
+
+@compiled
+def _paced(bank: Record, pace: int, quantity: int, i: int) -> float:
+    """Return a quantity of filter i at a pace, for the relative bandwidth in force."""
+    c, x = bank.paces, bank.quicker
     return c[0, pace, quantity, i] + x * (c[1, pace, quantity, i] + x * c[2, pace, quantity, i])
 
 
@@ -417,7 +439,7 @@ def _bound_velocity(bank: Record, y_sample: float) -> None:
 @compiled
 def _identify(bank: Record, estimator: Record, y_sample: float) -> bool:
     """Follow what a sample tells of the mass; return True if the mass in force changed."""
-    regression, calm = bank.regression[0], bank.lively_left == 0
+    regression, calm = bank.regression[0], bank.moved == bank.calm
     probed = bank.probe[0].samples > 0
     learned = learn(regression, estimator, y_sample, bank.mass, calm, probed)
     if regression.swung:
@@ -527,7 +549,7 @@ def doubt(bank: Record) -> float:
     if of_mass == 0.0 and not bank.holds:
         return 1.0
     of_delay = 0.0
-    if bank.lively_left > 0:
+    if _is_lively(bank):
         of_delay = _in_force(bank, bank.delay_counts) * regression.excess_spread
     return min(of_mass + of_delay, 1.0)
 

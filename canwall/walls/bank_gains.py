@@ -52,7 +52,12 @@ _IN_CONTACT = 0.3
 _DELAY_COUNTS = 10.0
 #: Share of half a count within which a reading does not contradict the prediction of a heavy hand,
 #: whose motion between two samples is known better than that. A light one needs each correction.
-_WITHIN = 0.8
+_WITHIN = 0.65
+#: What a sample differs by from the prediction beyond which the rest is followed more quickly
+#: [counts], and the share of the way from a filter's gain to its quickest one by which it is, of a
+#: hand whose steps of the encoder are felt much. A count is noise, and more is a handle that breaks
+#: loose or another push: a filter that follows both alike is felt, or has the handle hunt.
+_FAR, _FAR_SHARE = 1.5, 0.38
 #: Time constants of a filter for which samples have to be equal before its velocity is bounded by
 #: them. (Bounded by anything but the covariance that belongs to its gain, a filter of a handle at
 #: rest diverges.)
@@ -121,6 +126,7 @@ def set_filters(
         rigid: False on an elastic shaft: one walk for all, whatever wall and delay are.
     """
     lightest = bandwidth_of(force_walk, float(masses[0]), period, count) * period
+    bank["far"] = _FAR * count
     for i in range(len(masses)):
         plant = float(masses[i]), bank["viscous"][i].item(), spring, period
         walk, heavier, slower, lively = force_walk, float(masses[i] / masses[0]), 1.0, 1.0
@@ -132,7 +138,9 @@ def set_filters(
             slower = min(calm, _STEADY / lightest * felt_less**_STEADINESS)
             lively = max(min(1.0, _LIVELY_N / count_force) ** _STEADINESS, slower)
             walk *= heavier * slower**3  # by the cube of the bandwidth
-            bank["within"][i] = 0.5 * _WITHIN * max(1.0 - felt_less, 0.0) * count
+            felt_more = max(1.0 - felt_less, 0.0)
+            bank["within"][i] = 0.5 * _WITHIN * felt_more * count
+            bank["far_share"][i] = _FAR_SHARE * felt_more
         _set_filter(bank, i, kalman_model(*plant, count, walk))
         _set_paces(bank, i, plant, count, walk, lively / slower, rigid)
         _set_torques(bank, i, *plant)

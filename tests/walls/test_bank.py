@@ -136,7 +136,7 @@ def test_mass_that_was_known_grows_slowly_in_doubt(known: bool) -> None:
     assert bank["known"][0]
     bank["known"] = known
     # It moves by up to 60 counts a sample: on a calm one, pulses to and fro would be a swing.
-    bank["lively_left"] = bank["lively"]
+    bank["moved"] = 0
     before = bank["mass"][0]
     # It is forgotten, and the next torques move the handle as they would a tenfold mass.
     bank["regression"]["information"] = 0.0
@@ -198,7 +198,7 @@ def test_delay_in_doubt_counts_for_a_heavy_hand_that_moves(mass: float, share: f
     bank["place"] = np.interp(np.log(mass), np.log(MASSES), np.arange(len(MASSES)))
     bank["spread"], bank["regression"]["excess_spread"] = 0.1, 0.2
     assert doubt(bank[0]) == 0.1
-    bank["lively_left"] = 1
+    bank["moved"] = bank["lively"] - 1
     assert doubt(bank[0]) == pytest.approx(0.1 + share * 0.2, abs=2e-3)
     # To the digit it is interpolated between two filters.
     counts = np.clip(np.log10(MASSES / MASSES[0]), 0.0, 1.0)
@@ -242,7 +242,7 @@ def gain_of(
 @pytest.mark.parametrize("i", [3, 8])
 def test_state_is_that_of_the_matching_filter_alone(i: int) -> None:
     bank, estimator = bank_at(0.0)
-    bank["within"] = 0.0
+    bank["within"], bank["far"] = 0.0, np.inf
     # With the delay as told, and what torques do then.
     bank["regression"]["excess_before"] = 1e18, 0.0
     phi_after, newer = discrete(MASSES[i], VISCOUS[i], 0.65 * PERIOD)
@@ -415,7 +415,10 @@ def test_no_friction_keeps_up_a_swing(delay: float) -> None:
 
 
 def test_filters_are_quickest_behind_a_handle_that_moves() -> None:
-    """On the stiffest wall as well, until it has moved by less than 6 counts for 0.2 s."""
+    """On the stiffest wall as well, until it has moved by less than 6 counts for a time.
+
+    For 0.05 s the filters of hands that feel the encoder's steps are, and for 0.2 s the others.
+    """
     bank, _ = bank_at(0.0)
     set_pace(bank[0], 1e9)
     steadiest = bank["gain"][0].copy()
@@ -424,8 +427,12 @@ def test_filters_are_quickest_behind_a_handle_that_moves() -> None:
     quickest = bank["gain"][0].copy()
     assert np.all(quickest[:, 6:16] > 1.05 * steadiest[:, 6:16])
     bank["regression"]["way"] = 5.0 * COUNT
+    felt = MASSES > 3.01e-4
     for j in range(201):
-        np.testing.assert_array_equal(bank["gain"][0], quickest if j < 200 else steadiest)
+        gain = bank["gain"][0, :, :16]
+        for which, samples in ((felt, 50), (~felt, 200)):
+            expected = (quickest if j < samples else steadiest)[:, :16]
+            np.testing.assert_array_equal(gain[:, which], expected[:, which])
         set_pace(bank[0], 1e9)
 
 
@@ -463,17 +470,41 @@ def test_delay_that_is_found_adds_to_that_of_samples_that_lag() -> None:
 
 
 def test_reading_that_contradicts_nothing_leaves_a_heavy_hand_alone() -> None:
-    """Up to 0.4 counts for the heaviest, and nothing for those as light as a finger."""
+    """Up to 0.325 counts for the heaviest, and nothing for those as light as a finger."""
     bank, estimator = bank_at(0.0)
     within = bank["within"][0, :16] / COUNT
     assert np.all(within[MASSES <= 3e-4] == 0.0)
     assert np.all(np.diff(within[MASSES > 3e-4]) > 0.0)
-    np.testing.assert_allclose(within[15], 0.4 * (1.0 - 3.0 / 45.0), rtol=1e-9)
+    np.testing.assert_allclose(within[15], 0.325 * (1.0 - 3.0 / 45.0), rtol=1e-9)
     gain = bank["gain"][0, 2, 15]
     for off, corrected in ((0.3, 0.0), (-0.3, 0.0), (1.0, 1.0 - within[15])):
         bank["state"] = 0.0
         correct_bank(bank[0], estimator[0], off * COUNT)
         np.testing.assert_allclose(bank["state"][0, 2, 15], gain * corrected * COUNT, atol=1e-15)
+
+
+@pytest.mark.parametrize("i", [0, 6, 15])
+def test_what_is_far_from_the_prediction_is_followed_more_quickly(i: int) -> None:
+    """Beyond 1.5 counts, and only by the filters of hands that feel the encoder's steps."""
+    bank, estimator = bank_at(0.0)
+    set_pace(bank[0], 1e9)
+    own = bank["gain"][0, :, i].copy()
+    bank["regression"]["way"] = 6.1 * COUNT
+    set_pace(bank[0], 1e9)
+    quickest = bank["gain"][0, :, i].copy()
+    bank["regression"]["way"] = 0.0
+    for _ in range(200):
+        set_pace(bank[0], 1e9)
+    share = 0.38 * max(1.0 - 0.18 * 0.08 * PERIOD**2 / (MASSES[i] * COUNT), 0.0)
+    assert (share > 0.0) == (i > 3)
+    within = bank["within"][0, i] / COUNT
+    for off in (1.4, -1.4, 5.0, -5.0):
+        bank["state"] = 0.0
+        correct_bank(bank[0], estimator[0], off * COUNT)
+        near = np.sign(off) * (min(abs(off), 1.5) - within)
+        far = off - np.clip(off, -1.5, 1.5)
+        corrected = own * near + (own + share * (quickest - own)) * far
+        np.testing.assert_allclose(bank["state"][0, :, i], corrected * COUNT, rtol=1e-9)
 
 
 def test_nothing_is_learned_in_free_motion_nor_at_rest() -> None:
