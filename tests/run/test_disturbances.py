@@ -204,7 +204,7 @@ def test_an_adapting_model_tells_lost_from_late(begin: int) -> None:
     assert (late.trip, late.lag) == (Trip.NONE, 1)
 
 
-@pytest.mark.parametrize("begin", [270, 400, 1210])
+@pytest.mark.parametrize("begin", [270, 401, 1220])
 def test_a_contact_that_begins_in_a_probe_tells_lost_from_late(begin: int) -> None:
     """On the first samples of its force, in a grip on the wall of config/sim.toml."""
     settings = config.with_overrides(config.load(SIM_CONFIG), OPERATORS["grip"].keys)
