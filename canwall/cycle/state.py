@@ -132,10 +132,12 @@ CYCLE = np.dtype(
         ("shaft", "f8", (5,)),  # fields of ElasticShaft; zero: rigid
         # The estimator for TPDOs that are a cycle late since one was missing, and the one for a
         # TPDO that was lost, both without the bank: while they are being compared, how much
-        # likelier the first has been; the number of cycles that was found.
+        # likelier the first has been; the number of cycles that was found. A mass that was known
+        # is kept meanwhile: what the bank finds now rests on one of the two.
         ("lagging", ESTIMATOR, (1,)),
         ("losing", ESTIMATOR, (1,)),
         ("compares_lag", "?"),
+        ("keeps_mass", "?"),
         ("lag_evidence", "f8"),
         ("lag", "i8"),
         # Requests of the loop.

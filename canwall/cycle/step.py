@@ -27,6 +27,7 @@ from canwall.walls import (
     expect_torques,
     follow_estimator,
     is_probe_in_flight,
+    knows_mass,
     likelier,
     may_lag,
     note_missing_sample,
@@ -54,8 +55,11 @@ _MEASURING = int(Phase.MEASURING)
 #: A bit for each of the cycles that count as recent.
 _RECENT = (1 << RECENT_CYCLES) - 1
 #: Logarithm of the likelihood ratio at which it is decided if TPDOs have begun to be a cycle late:
-#: at least three samples.
-_LAG_EVIDENCE = 30.0
+#: at least three samples; and that of a hand whose mass was not known: both models are off then.
+_LAG_EVIDENCE, _LAG_EVIDENCE_OF_UNKNOWN = 30.0, 60.0
+#: Deviation of ln(mass) below which a mass that was not known then is, in spite of the doubt about
+#: the delay.
+_WELL_KNOWN_SPREAD = 0.05
 
 
 @compiled
@@ -135,9 +139,10 @@ def _identify_operator(cycle: Record, sample: float) -> None:
         wall.stiffest = stiffest(bank)
         if cycle.fade_left > 0:
             change_plant(cycle.faded[0].wall[0], estimator.mass, estimator.viscous)
-        if cycle.compares_lag:
+        if cycle.compares_lag and not cycle.keeps_mass:
             take_over(bank, cycle.lagging[0])
             take_over(bank, cycle.losing[0])
+            cycle.keeps_mass = 0.0 < bank.spread < _WELL_KNOWN_SPREAD
     cycle.rendered[0].wall[0].doubt = doubt(bank)
 
 
@@ -318,6 +323,7 @@ def _may_begin_to_lag(cycle: Record) -> bool:
         return False
     cycle.lagging[0] = estimator
     cycle.compares_lag = True
+    cycle.keeps_mass = knows_mass(cycle.bank[0])
     cycle.lag_evidence = 0.0
     return True
 
@@ -329,6 +335,14 @@ def _sync_of_sample(cycle: Record) -> int:
 
 
 @compiled
+def _go_on_lagging(cycle: Record) -> None:
+    """Put the estimator for TPDOs that are late in force, with the bank's mass."""
+    cycle.estimator[0] = cycle.lagging[0]
+    if cycle.bank[0].count > 0:
+        take_over(cycle.bank[0], cycle.estimator[0])
+
+
+@compiled
 def _compare_lag(cycle: Record) -> None:
     """Compare the sample with both predictions, and go on with the likelier one in the end."""
     lagging, losing = cycle.lagging[0], cycle.losing[0]
@@ -337,11 +351,12 @@ def _compare_lag(cycle: Record) -> None:
     if not probed or other_torque_acts(probe, estimator.in_flight, estimator.delay_periods):
         # What a probe alone moves tells who is at the handle, whom neither model knows yet.
         cycle.lag_evidence += likelier(lagging, losing, cycle.oriented)
-    if cycle.lag_evidence > _LAG_EVIDENCE:
-        cycle.estimator[0] = lagging
+    decisive = _LAG_EVIDENCE if cycle.keeps_mass else _LAG_EVIDENCE_OF_UNKNOWN
+    if cycle.lag_evidence > decisive:
+        _go_on_lagging(cycle)
         follow_estimator(cycle.bank[0], lagging)
         cycle.lag += 1
-    if abs(cycle.lag_evidence) > _LAG_EVIDENCE:
+    if abs(cycle.lag_evidence) > decisive:
         cycle.compares_lag = False
     else:
         correct(lagging, cycle.oriented)
@@ -357,7 +372,7 @@ def _end_lag(cycle: Record) -> None:
     if cycle.compares_lag:
         cycle.compares_lag = False
         if cycle.lag_evidence > 0.0:
-            cycle.estimator[0] = cycle.lagging[0]
+            _go_on_lagging(cycle)
             end_lag(cycle.estimator[0])
     elif cycle.lag:
         end_lag(cycle.estimator[0])

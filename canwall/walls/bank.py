@@ -461,6 +461,12 @@ def _identify(bank: Record, estimator: Record, y_sample: float) -> bool:
 
 
 @compiled
+def knows_mass(bank: Record) -> bool:
+    """Return True if the mass in force has been found, or told."""
+    return bank.count <= 1 or bank.known
+
+
+@compiled
 def _torque_acted(estimator: Record) -> bool:
     for age in range(estimator.delay_periods, MAX_DELAY + 1):
         if estimator.in_flight[age] != 0.0:

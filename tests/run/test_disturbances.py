@@ -204,10 +204,14 @@ def test_an_adapting_model_tells_lost_from_late(begin: int) -> None:
     assert (late.trip, late.lag) == (Trip.NONE, 1)
 
 
-@pytest.mark.parametrize("begin", [270, 401, 1220])
-def test_a_contact_that_begins_in_a_probe_tells_lost_from_late(begin: int) -> None:
-    """On the first samples of its force, in a grip on the wall of config/sim.toml."""
-    settings = config.with_overrides(config.load(SIM_CONFIG), OPERATORS["grip"].keys)
+@pytest.mark.parametrize(
+    ("operator", "begin"),
+    [("grip", begin) for begin in (270, 300, 400, 1210, 1290)]
+    + [("arm", begin) for begin in (330, 1255, 1261)],
+)
+def test_a_contact_tells_lost_from_late(operator: str, begin: int) -> None:
+    """Begun in a probe, in a contact or at rest in one, by a hand that is known or unknown."""
+    settings = config.with_overrides(config.load(SIM_CONFIG), OPERATORS[operator].keys)
     settings = settings.model_copy(update={"schedule": ()})
     cycles = round(DURATION_S / 1e-3)
     assert simulate(settings, cycles, disturbances=late_from(cycles, begin)).lag == 1
