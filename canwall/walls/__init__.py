@@ -14,13 +14,13 @@ from canwall.walls.bank import (
     predict_bank,
     reset_bank,
     set_bank,
-    set_pace,
     spread_in_force,
     stiffest,
     take_over,
     with_probe,
 )
 from canwall.walls.bank_gains import hand_damping, lightest_bandwidth, stiffest_walls
+from canwall.walls.bank_pace import set_pace
 from canwall.walls.estimator import (
     ESTIMATOR,
     MAX_DELAY,

@@ -2,8 +2,9 @@
 
 State and model in force are interpolated between the two filters next to the mass that a regression
 finds (`regression`), at the delay that it finds. The gains of the filters are made beforehand
-(`bank_gains`). Coulomb friction is left to the bias force d̂ (docs/laws.md). A hand that is
-known has a bank of one filter: it holds its mass, and finds the delay.
+(`bank_gains`); stiffness and motion decide which of them are in force (`bank_pace`). Coulomb
+friction is left to the bias force d̂ (docs/laws.md). A hand that is known has a bank of one filter:
+it holds its mass, and finds the delay.
 
 The bank works on an estimator in its steady state and hands over state and model to it. In a gap
 of samples, and until the estimator has nearly settled again, the estimator goes on alone and the
@@ -16,14 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
-from canwall.walls.bank_gains import (
-    PACES,
-    QUICKER,
-    SHORTEST_DELAY,
-    STEADIEST,
-    set_filters,
-    stiffest_walls,
-)
+from canwall.walls.bank_gains import PACES, QUICKER, STEADIEST, set_filters, stiffest_walls
+from canwall.walls.bank_pace import CALM_S, LIVELY_S, is_lively
 from canwall.walls.estimator import MAX_DELAY, set_model, set_model_delay, settle_within
 from canwall.walls.probe import (
     PROBE,
@@ -152,11 +147,6 @@ _NEARLY_SETTLED = 0.01
 _FORGOTTEN_S = 0.2
 #: Share of the way to the likeliest mass that is gone in a period.
 _FOLLOWED = 0.6
-#: Least speed of a handle that moves [rad/s], and the time after it for which filters are as quick
-#: as they may be, if their noise is felt and if not [s]: noise is felt at rest alone, and a filter
-#: that is slow to find the push after a blow makes a heavy hand bounce. After the latter time the
-#: handle is calm.
-_MOVES, _LIVELY_S, _CALM_S = 0.28, 0.05, 0.2
 #: Time without torque but a probe's after which a handle that moves flies, and time constant with
 #: which the trend of the push is forgotten in contact [s]: what a blow and the push after it do to
 #: an estimate is no trend.
@@ -166,11 +156,6 @@ _FLIGHT_S, _TREND_S = 0.04, 0.0028
 #: and faster it is a blow, whose errors are those of delay and mass; later, with friction, the
 #: trend would make the handle hunt.
 _LANDING_S, _PRESSED, _SLOW = 0.04, 4, 0.38
-#: Most equal samples from which on a velocity is bounded by them: a filter that is slower than that
-#: finds rest by itself.
-_EQUAL_SAMPLES = 32.0
-#: Relative change of the bandwidth that is worth other gains.
-_WORTH = 0.015
 #: Deviation of ln(mass) below which the mass counts as found.
 _FOUND_SPREAD = 0.2
 #: Lightest mass that explains the motion of a hand that is known, over the one told.
@@ -219,7 +204,7 @@ def set_bank(
     bank["log_step"] = math.log(masses[-1] / masses[0]) / (n - 1) if n > 1 else 0.0
     bank["spring"] = spring
     bank["forgotten"] = round(_FORGOTTEN_S / period)
-    bank["lively"], bank["calm"] = round(_LIVELY_S / period), round(_CALM_S / period)
+    bank["lively"], bank["calm"] = round(LIVELY_S / period), round(CALM_S / period)
     bank["flight"], bank["trend_left"] = round(_FLIGHT_S / period), math.exp(-period / _TREND_S)
     bank["landing"] = round(_LANDING_S / period)
     told = delay - margin
@@ -342,52 +327,6 @@ def _correct_in_flight(bank: Record, i: int, residual: float) -> None:
 def _follow_trend(bank: Record, i: int, correction: float) -> None:
     """Correct how fast the push changes: no faster than that of a hand."""
     bank.trend[i] = min(max(bank.trend[i] + correction, -HAND_RATE), HAND_RATE)
-
-
-@compiled
-def set_pace(bank: Record, stiffness: float) -> None:
-    """Make the filters as quick as handle and stiffness want; call before `correct_bank`."""
-    regression = bank.regression[0]
-    if abs(regression.way) >= _MOVES * regression.period:
-        bank.moved = 0
-    else:
-        bank.moved = min(bank.moved + 1, bank.calm)
-    resting = PACES - 1
-    if stiffness > 0.0:
-        resting = min(max(int(math.log2(bank.steadiest / stiffness)), 0), resting)
-    felt = PACES if _is_lively(bank) else resting
-    light = PACES if bank.moved < bank.calm else resting
-    quicker = bank.quicker
-    if bank.delay_in_force >= 0.0:
-        quicker = max(bank.delay, SHORTEST_DELAY) / max(bank.delay_in_force, SHORTEST_DELAY)
-        quicker = min(max(quicker, QUICKER[0]), QUICKER[2])
-    same = felt == bank.pace and light == bank.light_pace
-    if same and abs(quicker - bank.quicker) < _WORTH:
-        return
-    bank.pace, bank.light_pace, bank.quicker = felt, light, quicker
-    for i in range(bank.count):
-        pace = felt if bank.far_share[i] > 0.0 else light
-        for c in range(3):
-            own, quickest = _paced(bank, pace, c, i), _paced(bank, PACES, c, i)
-            bank.gain[c, i] = own
-            bank.far_gain[c, i] = own + bank.far_share[i] * (quickest - own)
-        bank.with_velocity[0, i] = _paced(bank, pace, 3, i)
-        bank.with_velocity[1, i] = _paced(bank, pace, 4, i)
-        equal_samples = _paced(bank, pace, 5, i)
-        bank.equal_samples[i] = equal_samples if equal_samples <= _EQUAL_SAMPLES else math.inf
-
-
-@compiled
-def _is_lively(bank: Record) -> bool:
-    """Return True while even filters whose noise is felt are as quick as they may be."""
-    return bank.moved < bank.lively
-
-
-@compiled
-def _paced(bank: Record, pace: int, quantity: int, i: int) -> float:
-    """Return a quantity of filter i at a pace, for the relative bandwidth in force."""
-    c, x = bank.paces, bank.quicker
-    return c[0, pace, quantity, i] + x * (c[1, pace, quantity, i] + x * c[2, pace, quantity, i])
 
 
 @compiled
@@ -555,7 +494,7 @@ def doubt(bank: Record) -> float:
     if of_mass == 0.0 and not bank.holds:
         return 1.0
     of_delay = 0.0
-    if _is_lively(bank):
+    if is_lively(bank):
         of_delay = _in_force(bank, bank.delay_counts) * regression.excess_spread
     return min(of_mass + of_delay, 1.0)
 
