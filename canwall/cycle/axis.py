@@ -72,6 +72,8 @@ class WallAxis:
     revision: int = 0
     #: Reason from outside the cycle to give up the wall; empty if there is none.
     reported: str = ""
+    #: The first such reason while the drive was being enabled, which alone ends nothing.
+    suspected: str = ""
     #: Strikes after which the next of the alternating walls comes, and before the first of them.
     next_turn: int = 1
     turns_since: int = 0
@@ -122,11 +124,13 @@ class WallAxis:
     def give_up(self, text: str) -> None:
         """End the wall for a reason from outside the cycle; the first reason counts.
 
-        Has no effect unless the axis is active.
+        While the drive is being enabled it is only noted, and has no effect while it is disabled.
         """
         if self.active and not self.cycle["trip"][0]:
             self.reported = text
             self.cycle["trip"] = np.int64(Trip.REPORTED)
+        elif self.cycle["phase"][0] == Phase.ENABLING:
+            self.suspected = self.suspected or text
 
     def open_controls(self, controls: Controls) -> None:
         """Have the compiled core look at words of control in every cycle from now on."""

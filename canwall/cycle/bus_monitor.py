@@ -1,11 +1,11 @@
-"""Frames outside the cycle that end a wall: EMCY, NMT states, bus-off, a second SYNC or drive."""
+"""Frames outside the cycle that end a wall: EMCY, NMT, bus-off, a second master or drive."""
 
 from collections.abc import Sequence
 
 import can
 from canopen.emcy import EmcyError
 
-from canwall.bus.can_ids import EMCY, ERROR_CONTROL
+from canwall.bus.can_ids import EMCY, ERROR_CONTROL, NMT
 from canwall.cycle.axis import WallAxis
 from canwall.drive import Link
 
@@ -15,6 +15,8 @@ _NMT_STATES = {
     4: "is in NMT STOPPED",
     127: "is in NMT PRE-OPERATIONAL",
 }
+#: Commands of NMT after which a drive takes no RPDO (CiA 301, 7.2.8.3.1).
+_NMT_COMMANDS = {2: "STOP", 128: "PRE-OPERATIONAL", 129: "RESET NODE", 130: "RESET COMMUNICATION"}
 #: Class of an error frame, as Linux's SocketCAN has it in the identifier (linux/can/error.h).
 _BUS_OFF = 0x40
 #: TPDOs beyond one for each SYNC, late ones aside, that prove a second sender.
@@ -24,7 +26,8 @@ _SURPLUS = 10
 class BusMonitor:
     """Turns such frames into trips of the axis they concern, in the cycle in which they arrive.
 
-    Nothing trips before a wall is rendered, or while its drive is being disabled.
+    Nothing trips before a wall is rendered, or while its drive is being disabled. What comes while
+    it is being enabled is told if that fails (`WallAxis.suspected`).
     """
 
     def __init__(self, link: Link, axes: Sequence[WallAxis], sync_cob_id: int | None) -> None:
@@ -42,8 +45,10 @@ class BusMonitor:
         for axis in axes:
             node_id = axis.node.node_id
             link.network.subscribe(axis.setup.tpdo.cob_id, self._another_tpdo)
+            link.network.subscribe(axis.setup.rpdo.cob_id, self._another_rpdo)
             link.network.subscribe(EMCY + node_id, self._emergency)
             link.network.subscribe(ERROR_CONTROL + node_id, self._error_control)
+        link.network.subscribe(NMT, self._another_nmt_command)
         if sync_cob_id is not None:
             link.network.subscribe(sync_cob_id, self._another_sync)
         link.on_error_frame = self._error_frame
@@ -63,7 +68,7 @@ class BusMonitor:
 
     def _error_control(self, can_id: int, data: bytearray, timestamp: float) -> None:
         axis = self._axis(can_id - ERROR_CONTROL)
-        if not axis.active or len(data) != 1 or data[0] & 0x7F == _OPERATIONAL:
+        if len(data) != 1 or data[0] & 0x7F == _OPERATIONAL:
             return
         state = data[0] & 0x7F
         axis.give_up(f"the drive {_NMT_STATES.get(state, f'is in NMT state {state}')}")
@@ -79,6 +84,17 @@ class BusMonitor:
                 f"more than one TPDO ({can_id:#05x}) for each SYNC: two drives have node-ID "
                 f"{axis.node.node_id}, or another node sends under this identifier"
             )
+
+    def _another_rpdo(self, can_id: int, data: bytearray, timestamp: float) -> None:
+        axis = next(axis for axis in self._axes if axis.setup.rpdo.cob_id == can_id)
+        axis.give_up(f"somebody else sends RPDOs ({can_id:#05x}) to the drive as well: end it")
+
+    def _another_nmt_command(self, can_id: int, data: bytearray, timestamp: float) -> None:
+        if len(data) != 2 or (command := _NMT_COMMANDS.get(data[0])) is None:
+            return
+        for axis in self._axes:
+            if data[1] in (0, axis.node.node_id):
+                axis.give_up(f"somebody else has sent NMT {command} ({can_id:#05x}): end it")
 
     def _another_sync(self, can_id: int, data: bytearray, timestamp: float) -> None:
         for axis in self._axes:

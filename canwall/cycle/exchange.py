@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.bus import DataFrame
-from canwall.bus.can_ids import EMCY, ERROR_CONTROL, PDOS
+from canwall.bus.can_ids import EMCY, ERROR_CONTROL, NMT, PDOS
 from canwall.bus.raw_socket import CAN_RTR
 from canwall.compiled import data_to_number, number_to_data
 from canwall.cycle import core as cycle_core
@@ -349,8 +349,9 @@ def _lay_out(axis: WallAxis) -> None:
 def _handling(axes: Sequence[WallAxis]) -> NDArray[np.uint8]:
     """Return the handling of frames by CAN-ID; those that may end a wall are urgent."""
     handling = np.zeros(0x800, np.uint8)
-    handling[axes[0].setup.sync_cob_id] = Handling.URGENT
+    handling[[NMT, axes[0].setup.sync_cob_id]] = Handling.URGENT
     for axis in axes:
+        handling[axis.setup.rpdo.cob_id] = Handling.URGENT
         handling[EMCY + axis.node.node_id] = Handling.URGENT
         handling[ERROR_CONTROL + axis.node.node_id] = Handling.URGENT_UNLESS_OPERATIONAL
     return handling

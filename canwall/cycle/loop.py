@@ -17,7 +17,7 @@ from canwall.cycle.state import (
     set_watching,
     start_at,
 )
-from canwall.cycle.trip_text import latest_emergency, shown_state, trip_text
+from canwall.cycle.trip_text import latest_emergency, shown_state, suspected, trip_text
 from canwall.cycle.trips import Trip
 from canwall.drive import (
     Controlword,
@@ -156,12 +156,13 @@ class Loop:
                     raise WallGivenUpError(self._say(axis, returns))
                 if _is_silent(axis):
                     silent = f"no TPDO for {_SILENT_CYCLES} cycles while enabling"
-                    raise WallGivenUpError(self._say(axis, silent))
+                    raise WallGivenUpError(self._say(axis, silent + suspected(axis)))
             self.exchange.cycle()
             self._check()
         for axis, way in zip(self._axes, ways, strict=True):
             if not _advance_enabling(axis, way):
                 stays = f"the drive stays in {shown_state(axis)}{latest_emergency(axis)}"
+                stays += suspected(axis)
                 raise WallGivenUpError(self._say(axis, stays))
 
     def _first_positions(self) -> None:
@@ -175,7 +176,8 @@ class Loop:
             if not waiting:
                 break
         else:
-            raise WallGivenUpError(self._say(waiting[0], f"no TPDO within {patience} SYNCs"))
+            silent = f"no TPDO within {patience} SYNCs{suspected(waiting[0])}"
+            raise WallGivenUpError(self._say(waiting[0], silent))
         for axis in self._axes:
             start_at(axis.cycle, int(axis.cycle["counts"][0]))
 

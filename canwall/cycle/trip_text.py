@@ -23,6 +23,11 @@ def latest_emergency(axis: WallAxis) -> str:
     return f"; EMCY {latest.code:#06x} ({latest.get_desc() or 'no description'})"
 
 
+def suspected(axis: WallAxis) -> str:
+    """Return what was heard while enabling as a suffix of a message; empty if there was nothing."""
+    return f"; {axis.suspected}" if axis.suspected else ""
+
+
 def trip_text(axis: WallAxis, exchange: Exchange) -> str:
     """Describe the trip with its cycle, its value and the key of the limit."""
     cycle, row = axis.cycle[0], axis.row[0]

@@ -13,6 +13,7 @@ from can.interfaces.virtual import VirtualBus
 from numpy.typing import NDArray
 from rig import RPDO1, SDO_REQUEST, SYNC, TPDO1, Loop, Rig, RigFactory, lack, settings_with
 
+from canwall.bus.can_ids import NMT
 from canwall.config import Settings
 from canwall.cycle import Outcome, WallStage, run_loop
 from canwall.cycle import exchange as exchange_module
@@ -251,16 +252,30 @@ def test_drive_that_never_enables(make_rig: RigFactory) -> None:
     assert all(torque == 0 for _, torque in loop.rig.rpdos())
 
 
-def test_drive_that_falls_silent_while_it_is_enabled(make_rig: RigFactory) -> None:
+@pytest.mark.parametrize(
+    ("frame", "reason"),
+    [
+        (None, ""),
+        ((SYNC, b""), "; somebody else sends SYNC (0x080) as well: end it, or set bus.sync"),
+        ((NMT, b"\x80\x00"), "; somebody else has sent NMT PRE-OPERATIONAL (0x000): end it"),
+        ((NMT, b"\x80\x07"), ""),  # another node
+        ((0x705, b"\x7f"), "; the drive is in NMT PRE-OPERATIONAL"),
+    ],
+)
+def test_drive_that_falls_silent_while_it_is_enabled(
+    make_rig: RigFactory, frame: tuple[int, bytes] | None, reason: str
+) -> None:
     loop = Loop(make_rig(pressing()))
 
     def silence(j: int) -> bool:
         if j == 2:
             loop.rig.tampering.mute.add(TPDO1)
+        if j == 3 and frame is not None:
+            loop.rig.inject(*frame)
         return False
 
     outcome = loop.run(500, silence)
-    assert outcome.trips == ["no TPDO for 50 cycles while enabling"]
+    assert outcome.trips == [f"no TPDO for 50 cycles while enabling{reason}"]
     assert outcome.disabled  # SDO still says so
     assert all(torque == 0 for _, torque in loop.rig.rpdos())
 
@@ -383,6 +398,31 @@ def test_second_producer_of_the_sync(make_rig: RigFactory) -> None:
         trip
         == "cycle 500 (0.500 s): somebody else sends SYNC (0x080) as well: end it, or set bus.sync"
     )
+
+
+@pytest.mark.parametrize(
+    ("can_id", "data", "text"),
+    [
+        (
+            RPDO1,
+            b"\x0f\x00\x64\x00",
+            "somebody else sends RPDOs (0x205) to the drive as well: end it",
+        ),
+        (NMT, b"\x80\x05", "somebody else has sent NMT PRE-OPERATIONAL (0x000): end it"),
+        (NMT, b"\x81\x00", "somebody else has sent NMT RESET NODE (0x000): end it"),
+    ],
+)
+def test_second_master(make_rig: RigFactory, can_id: int, data: bytes, text: str) -> None:
+    loop = Loop(make_rig(pressing()))
+    trip = trip_of(loop, lambda j: loop.rig.inject(can_id, data))
+    assert trip == f"cycle 500 (0.500 s): {text}"
+
+
+@pytest.mark.parametrize(("can_id", "data"), [(NMT, b"\x01\x00"), (NMT, b"\x80\x07"), (0x207, b"")])
+def test_frames_for_others_say_nothing(make_rig: RigFactory, can_id: int, data: bytes) -> None:
+    loop = Loop(make_rig(pressing()))
+    outcome = loop.run(300, lambda j: j == PRESSING or loop.rig.inject(can_id, data) or False)
+    assert outcome.trips == []
 
 
 def test_error_frames_are_counted_and_bus_off_ends_the_run(make_rig: RigFactory) -> None:
