@@ -254,7 +254,7 @@ class LiveRun:
         try:
             with self._posting:
                 return self._mailbox.post(text, timeout_s)
-        except TimeoutError:
+        except OSError:  # not answered in time, or closed at the end of the run
             ended = self._status.read() is not None and self.status().ended
             why = "has ended" if ended else "does not take the change"
             raise RunFailedError(f"{self.folder.path}: the run {why}") from None

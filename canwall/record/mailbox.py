@@ -4,10 +4,12 @@ A request is a text. The run that owns the mailbox answers it with the cycle fro
 force, or with the reason why it is not; the sender waits for that.
 """
 
+import contextlib
 import fcntl
 import mmap
 import os
 import time
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -90,14 +92,14 @@ class Mailbox:
         """Post a request and wait for the answer; called by the sender.
 
         Returns the cycle from which on it is in force. Raises ConfigError with the reason if it is
-        refused, and TimeoutError if it is not answered in time; it does not come into force then.
+        refused, TimeoutError if it is not answered in time, and OSError if the mailbox is closed;
+        it does not come into force then.
         """
         data = text.encode()
         if len(data) > _TEXT:
             raise ConfigError(f"a request of {len(data)} bytes; {_TEXT} is the most")
         deadline = time.monotonic() + timeout_s
-        self._take_turn(deadline)
-        try:
+        with self._turn(deadline):
             self._wait(deadline)
             self._write(data)
             fence()
@@ -115,22 +117,29 @@ class Mailbox:
             if self.withdrawn():
                 raise TimeoutError
             raise ConfigError(self._text().decode(errors="replace"))
-        finally:
-            fcntl.flock(self._descriptor, fcntl.LOCK_UN)
 
-    def _take_turn(self, deadline: float) -> None:
-        """Wait for other senders; the lock of one that dies is released, one may also stand still.
+    @contextlib.contextmanager
+    def _turn(self, deadline: float) -> Iterator[None]:
+        """Keep other senders waiting; the lock of one that dies is released, one may stand still.
 
-        Raises TimeoutError.
+        Raises TimeoutError, and OSError if the mailbox is closed.
         """
-        while True:
+        descriptor = os.dup(self._descriptor)  # another thread may close the mailbox meanwhile
+        try:
+            while True:
+                try:
+                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                except BlockingIOError:
+                    if time.monotonic() >= deadline:
+                        raise TimeoutError from None
+                    time.sleep(_POLL_S)
             try:
-                fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                return
-            except BlockingIOError:
-                if time.monotonic() >= deadline:
-                    raise TimeoutError from None
-                time.sleep(_POLL_S)
+                yield
+            finally:
+                fcntl.flock(descriptor, fcntl.LOCK_UN)
+        finally:
+            os.close(descriptor)
 
     def _wait(self, deadline: float) -> None:
         while self.waiting():

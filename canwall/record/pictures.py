@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from canwall.config import short_law
 from canwall.figure_style import CHATTER, COLOURS, DPI, PAGE_IN, STYLE
 from canwall.record.folder import RunFolder, numbers, read_signals, whole_file
 
@@ -80,6 +81,7 @@ def run_figure(signals: "pa.Table", strikes: list[dict[str, Any]]) -> Figure:
         signals: Rows of the run, with the columns DRAWN.
         strikes: Strikes of its summary.
     """
+    strikes = [strike | {"law": short_law(strike["law"])} for strike in strikes]
     with mpl.rc_context(STYLE | _QUICK):
         colours = law_colours(strikes)
         shown = shown_strikes(signals, strikes)[:2]

@@ -15,16 +15,19 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.text import Text
 
 from canwall.config import ConfigError
 from canwall.figure_style import CHATTER
 from canwall.record import RunFolder
+from canwall.record.folder import read_signals
 from canwall.record.pictures import (
     DRAWN,
     draw_in_force,
     draw_strikes,
     law_colours,
     plot_run,
+    run_figure,
     shown_strikes,
     thin_out,
     warm_up,
@@ -235,3 +238,14 @@ def test_stiffness_asked_for_does_not_hide_that_in_force(asked: float, top: floa
     low, high = axes.get_ylim()
     assert low == 0.0
     assert high == pytest.approx(top, rel=0.02)
+
+
+def test_own_law_has_its_short_name(four_strikes: Record) -> None:
+    own = [
+        s | {"law": f"/home/of/somebody/laws.py:{s['law']}"}
+        for s in four_strikes.summary["strikes"]
+    ]
+    drawn = run_figure(read_signals(four_strikes.folder / "signals.parquet", DRAWN), own)
+    texts = [text.get_text() for text in drawn.findobj(Text)]
+    assert "laws.py:mean_force" in texts
+    assert not [text for text in texts if "somebody" in text]
