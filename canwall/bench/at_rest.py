@@ -7,6 +7,7 @@ from canwall.bench.budget import USABLE, cycle_budget
 from canwall.bench.findings import DIFFERENT_FILE, OWN_FILE, Findings
 from canwall.bench.scan import scan_nodes
 from canwall.bench.soft_wall import WORST_DELAY, with_fingertip
+from canwall.config import Drive as DriveSettings
 from canwall.config import Settings
 from canwall.drive import DriveNode, DriveSetup, Link, PdoLayout
 from canwall.drive import objects as od
@@ -43,13 +44,14 @@ def describe_identity(node: DriveNode, settings: Settings, findings: Findings) -
 
 
 def describe_setup(
-    setup: DriveSetup, identity: Identity, settings: Settings, findings: Findings
+    node: DriveNode, setup: DriveSetup, identity: Identity, settings: Settings, findings: Findings
 ) -> None:
     """Describe the set-up of a drive: mode, units, PDOs, watchdog."""
     findings.add("mode", "0x6060", str(setup.mode))
     if setup.scales is not None:
         for found, whence in setup.scales.sources:
             findings.add("units", whence, found)
+        _compare_rated_torque(node, setup, settings.drive, findings)
     findings.add("PDO", "TPDO, with every SYNC", _shown(setup.tpdo))
     effect = "at the next SYNC" if setup.synchronous else "on reception"
     findings.add("PDO", f"RPDO, effective {effect}", _shown(setup.rpdo))
@@ -71,6 +73,25 @@ def describe_setup(
     )
     for passed_over in watchdog.passed_over:
         findings.add("watchdog", "passed over", passed_over)
+
+
+def _compare_rated_torque(
+    node: DriveNode, setup: DriveSetup, settings: DriveSettings, findings: Findings
+) -> None:
+    """Doubt a rated torque that was given and is far from 0x6076, in whatever unit that is."""
+    given = settings.rated_torque_nm
+    if given is None or not node.has(od.MOTOR_RATED_TORQUE):
+        return
+    value = node.read(od.MOTOR_RATED_TORQUE)
+    units = (settings.rated_torque_unit_nm or 1e-3, 1e-6)
+    if any(0.5 * given <= value * unit <= 2.0 * given for unit in units):
+        return
+    findings.add(
+        "units",
+        "0x6076",
+        f"{value}, {value * units[0]:g} N·m, but drive.rated_torque_nm is {given:g}",
+        do="see which of them is on the motor's plate: all torques are parts of it",
+    )
 
 
 def describe_limits(

@@ -45,7 +45,7 @@ def diagnose(
         findings.add("bus", report.what, report.found, report.well, report.do)
     with ExitStack() as stack:
         try:
-            link = stack.enter_context(on_the_bus(settings))
+            link = stack.enter_context(on_the_bus(measurement_settings(settings)))
         except (DriveError, can.CanError) as error:
             findings.add_trouble("bus", "other masters", str(error))
             return
@@ -90,7 +90,7 @@ def examine(
                 lenient = settings.drive.model_copy(update={"accept_no_watchdog": True})
                 limit = settings.limits.torque_nm
                 setup = set_up(node, lenient, settings.bus, limit, real_time=True)
-                describe_setup(setup, identity, settings, findings)
+                describe_setup(node, setup, identity, settings, findings)
                 describe_limits(node, setup, settings, findings)
                 describe_budget(node, setup, settings, findings)
                 Trial(node, setup, settings, announce, findings, move).make()

@@ -34,7 +34,8 @@ def trip_text(axis: WallAxis, exchange: Exchange) -> str:
     j = int(row["j"])
     trip = Trip(int(cycle["trip"]))
     position = float(row["position_rad"])
-    if trip is Trip.JUMP and not cycle["position_low"] <= position <= cycle["position_high"]:
+    jump = trip is Trip.JUMP
+    if jump and not cycle["position_low"] <= position <= cycle["position_high"]:
         trip = Trip.POSITION  # which says more
     match trip:
         case Trip.SPEED:
@@ -42,6 +43,9 @@ def trip_text(axis: WallAxis, exchange: Exchange) -> str:
             what = f"speed {speed:.3g} rad/s beyond limits.speed_rad_s"
         case Trip.POSITION:
             what = f"position {position:.4g} rad outside limits.position_rad"
+            if jump and not _missing_recently(axis):
+                way = abs(float(cycle["innovation"]))
+                what += f", by a jump of {way:.3g} rad: look to the encoder and its cable"
         case Trip.JUMP:
             what = (
                 f"the position jumped by {abs(float(cycle['innovation'])):.3g} rad, more than "

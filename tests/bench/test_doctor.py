@@ -9,6 +9,7 @@ from commands import command, config_file
 from rig import SIM_CONFIG, Rig, RigFactory, settings_with
 
 from canwall.bench import Findings, examine
+from canwall.bench.doctor import diagnose
 from canwall.cycle import Exchange
 from canwall.drive import REQUIRED_OBJECTS, DriveNode
 
@@ -209,3 +210,28 @@ def test_what_cannot_be_put_back_is_a_trouble(rig: Rig) -> None:
     examine(rig.link, rig.settings, REQUIRED_OBJECTS, announce, findings)
     assert not findings.well
     assert "writing 0x1 to 0x6007:00 failed" in found(findings, "put back", "not done")
+
+
+def test_rated_torque_that_is_not_the_drive_s_is_doubted(make_rig: RigFactory) -> None:
+    """By a slipped decimal, say."""
+    simulated = {"simulation.rated_torque_nm": 0.637}
+    for given, doubted in ((6.37, True), (0.6, False)):
+        told = {"drive.rated_torque_nm": given}
+        rig = make_rig(settings_with(SETTINGS | simulated | told))
+        findings, _ = examined(rig)
+        said = [line.found for line in findings.lines if line.what == "0x6076"]
+        doubt = f"637, 0.637 N·m, but drive.rated_torque_nm is {given:g}"
+        assert said == ([doubt] if doubted else [])
+
+
+def test_simulated_drive_is_loaded_before_it_is_examined(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The doctor keeps real time, whatever the configuration does, and a watchdog does not wait."""
+    loaded: list[bool] = []
+    monkeypatch.setattr("canwall.simdrive.load_compiled_code", loaded.append)
+
+    def begins(step: str) -> None:
+        assert loaded == [False], step
+
+    settings = settings_with(SETTINGS | {"bus.pace": "simulated"})
+    diagnose(settings, REQUIRED_OBJECTS, begins, Findings())
+    assert loaded == [False]

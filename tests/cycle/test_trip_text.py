@@ -56,7 +56,8 @@ def test_jump_beyond_the_position_limits_names_these(make_rig: RigFactory) -> No
     loop.record["trip"] = Trip.JUMP
     loop.axis.row["position_rad"] = 3.5
     said = trip_text(loop.axis, loop.exchange)
-    assert said.endswith("position 3.5 rad outside limits.position_rad")
+    assert "position 3.5 rad outside limits.position_rad, by a jump of " in said
+    assert said.endswith(" rad: look to the encoder and its cable")
 
 
 @pytest.mark.parametrize("side", ["below", "above"])
