@@ -166,7 +166,11 @@ class _Sweep:
         stored = {name: point[name].item() for name in found if name in point}
         columns = [motion.rows[name] for name in SIGNALS]
         columns += [motion.felt, motion.referent, motion.referent_felt]
-        pyramid = Pyramid(np.ascontiguousarray(motion.rows["t_s"]), np.array(columns, np.float32))
+        with np.errstate(
+            over="ignore"
+        ):  # a law may ask for any force, and what is shown is then inf
+            shown = np.array(columns, np.float32)
+        pyramid = Pyramid(np.ascontiguousarray(motion.rows["t_s"]), shown)
         text = {
             "columns": _COLUMNS,
             "cycle_s": point["period"].item(),

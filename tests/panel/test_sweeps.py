@@ -146,3 +146,12 @@ def test_a_measure_that_differs_is_told(tmp_path: Path, made: tuple[Client, xr.D
     changed.to_netcdf(tmp_path / "map.nc", engine="h5netcdf")
     text, _ = struck(Client(tmp_path))
     assert not text["same"]
+
+
+def test_strike_of_a_law_that_asks_for_any_force(tmp_path: Path) -> None:
+    (tmp_path / "big.py").write_text(
+        "def big(wall):\n    return 1e300 if wall.y < 0.0 else 0.0\n", encoding="utf-8"
+    )
+    one = AXES | {"law": f"{tmp_path / 'big.py'}:big", "stiffness_normalised": "0.1:0.2:2"}
+    swept(tmp_path / "map.nc", **one)
+    struck(Client(tmp_path), delay=0, stiffness_normalised=0, damping_normalised=0, speed=0)
