@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from canwall.config import Settings
+from canwall.config import ConfigError, Settings
 from canwall.cycle import ExperimentError, WallAxis
 from canwall.identify.break_away import break_away
 from canwall.identify.estimates import Estimate, ServoFit, UntellingDataError
@@ -185,17 +185,26 @@ def identify(
 
 
 def with_simulated_hand_still(settings: Settings, holding: bool) -> Settings:
-    """Return settings whose simulated hand holds the handle still, or has let it go."""
+    """Return settings whose simulated hand holds the handle still, or has let it go.
+
+    Raises ConfigError if it is to hold the handle and is none.
+    """
     if settings.simulation is None:
         return settings
+    hand = settings.simulation.hand
+    if holding and not hand.inertia_kg_m2 and not hand.stiffness_nm_per_rad:
+        raise ConfigError(
+            "[simulation.hand] is nobody, without inertia and stiffness: give it some, or leave "
+            "--hand out"
+        )
     update: dict[str, Any] = {"strikes": 0, "script": (), "random": None}
     if not holding:
         nobody = dict.fromkeys(
             ("inertia_kg_m2", "damping_nm_s_per_rad", "stiffness_nm_per_rad"), 0.0
         )
         update |= nobody | {"grip": True}
-    hand = settings.simulation.hand.model_copy(update=update)
-    simulation = settings.simulation.model_copy(update={"hand": hand})
+    still = hand.model_copy(update=update)
+    simulation = settings.simulation.model_copy(update={"hand": still})
     return settings.model_copy(update={"simulation": simulation})
 
 

@@ -12,10 +12,10 @@ from commands import command, config_file
 from rig import eds_with, settings_with
 
 from canwall import config
-from canwall.config import Settings
+from canwall.config import ConfigError, Settings
 from canwall.identify import UntellingDataError, identify
 from canwall.identify.excitation import Bounds, HandExcitation
-from canwall.identify.session import Identification, stiction
+from canwall.identify.session import Identification, stiction, with_simulated_hand_still
 from canwall.record import ROW
 
 #: Changes of config/sim.toml: nobody at the handle, a real current loop, a model that is off.
@@ -217,3 +217,9 @@ def test_hand_excitation_is_small_and_ends() -> None:
         torques.append(torque)
     assert len(torques) == round(HandExcitation.duration_s / settings.bus.cycle_s)
     assert max(map(abs, torques)) <= settings.estimator.measure_torque_nm
+
+
+def test_nobody_holds_no_handle() -> None:
+    nobody = {f"simulation.hand.{key}": 0.0 for key in ("inertia_kg_m2", "stiffness_nm_per_rad")}
+    with pytest.raises(ConfigError, match=r"\[simulation\.hand\] is nobody"):
+        with_simulated_hand_still(settings_with(nobody), holding=True)
