@@ -221,6 +221,6 @@ def test_hand_excitation_is_small_and_ends() -> None:
 
 def test_nobody_holds_no_handle() -> None:
     keys = ("inertia_kg_m2", "damping_nm_s_per_rad", "stiffness_nm_per_rad")
-    nobody = {f"simulation.hand.{key}": 0.0 for key in keys} | {"simulation.hand.grip": True}
+    nobody = {"simulation.hand": dict.fromkeys(keys, 0.0) | {"grip": True}}
     with pytest.raises(ConfigError, match=r"\[simulation\.hand\] is nobody"):
         with_simulated_hand_still(settings_with(nobody), holding=True)
