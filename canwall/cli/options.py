@@ -1,5 +1,6 @@
 """Arguments and options shared by several commands, and the settings made from them."""
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -59,6 +60,12 @@ def settings_from(path: Path | None, **overrides: Any) -> "Settings":
 def refuse_to_overwrite(output: Path) -> None:
     """Raise InputError for a file that exists."""
     if output.is_file():
+        raise InputError(f"{output}: exists already; choose another --output")
+
+
+def refuse_what_exists(output: Path) -> None:
+    """Raise InputError for anything that exists, a folder as well."""
+    if os.path.lexists(output):
         raise InputError(f"{output}: exists already; choose another --output")
 
 

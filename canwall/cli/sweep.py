@@ -1,6 +1,5 @@
 """Commands for sweeps: `sweep`, and `plot`, which draws recorded runs and sweeps."""
 
-import os
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -8,7 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from canwall.cli.ending import StoppedError
-from canwall.cli.options import ConfigArgument, JsonOption, LawsOption, settings_from
+from canwall.cli.options import (
+    ConfigArgument,
+    JsonOption,
+    LawsOption,
+    refuse_what_exists,
+    settings_from,
+)
 from canwall.cli.output import ProgressDisplay, console, print_json, print_text, say
 from canwall.errors import InputError, RunFailedError
 from canwall.extras import need
@@ -152,8 +157,8 @@ def _compute_law_table(
     settings = settings_from(config_file)
     from canwall.sweep import OPERATORS, compute_law_table, write_sweep
 
-    if output is not None and os.path.lexists(output):
-        raise InputError(f"{output}: exists already; choose another --output")
+    if output is not None:
+        refuse_what_exists(output)
     with ProgressDisplay() as display:
         progress = partial(display.count, "striking walls")
         operators = operators or list(OPERATORS)

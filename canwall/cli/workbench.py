@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from canwall.cli.completion import complete_law
-from canwall.cli.options import JsonOption, refuse_to_overwrite
+from canwall.cli.options import JsonOption, refuse_to_overwrite, refuse_what_exists
 from canwall.cli.output import ProgressDisplay, console, print_json
 from canwall.errors import InputError
 from canwall.extras import need
@@ -102,10 +102,11 @@ def _parse_options(assignments: list[str]) -> dict[str, float]:
 
 
 def figures(
-    output: Annotated[Path, typer.Option(help="Folder for pictures, data and index.md.")],
+    output: Annotated[Path, typer.Option(help="New folder for pictures, data and index.md.")],
 ) -> int:
     """Draw the figures of the chapter, each with its data, and a comparison of all laws."""
     need("plot", "sweep")
+    refuse_what_exists(output)
     from canwall.workbench.figures import write_figures
 
     with ProgressDisplay() as display:

@@ -457,6 +457,21 @@ def test_command_is_a_call_of_it(
     assert capsys.readouterr().out == f"{tmp_path / 'here' / 'index.md'}\n"
 
 
+def test_folder_that_exists_is_kept(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Nothing is computed: a call of None would fail."""
+    (tmp_path / "index.md").write_text("mine")
+    monkeypatch.setattr(figures_module, "write_figures", None)
+    monkeypatch.setattr(sys, "argv", ["canwall", "figures", "--output", str(tmp_path)])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 2
+    said = f"canwall: {tmp_path}: exists already; choose another --output\n"
+    assert capsys.readouterr().err == said
+    assert (tmp_path / "index.md").read_text() == "mine"
+
+
 def test_folder_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     taken = tmp_path / "file"
     taken.touch()
