@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -14,6 +15,7 @@ from canwall.bench.latency import Histogram, Latency, LatencyPhase
 from canwall.errors import InputError
 from canwall.extras import is_installed
 from canwall.figure_style import COLOURS, DPI, PAGE_IN, STYLE
+from canwall.record import refuse_taken
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -132,6 +134,20 @@ def _bin_counts(histogram: Histogram, edges: NDArray[np.float64]) -> NDArray[np.
     return counts
 
 
+def prepare_folder(folder: Path) -> None:
+    """Make the folder of a report before the measurement, which would be lost for want of it.
+
+    Raises InputError if it cannot be written, or holds a report already.
+    """
+    refuse_taken(folder / f"latency.{ending}" for ending in ("json", "csv", "png"))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise _unwritable(folder, error) from None
+
+
 def write_latency(latency: Latency, folder: Path) -> list[Path]:
     """Write latency.json, latency.csv and latency.png into a folder and return their paths.
 
@@ -153,8 +169,12 @@ def write_latency(latency: Latency, folder: Path) -> list[Path]:
             paths.append(folder / "latency.png")
             _draw_figure(latency, paths[-1])
     except OSError as error:
-        raise InputError(f"--output {folder}: {error.strerror}") from None
+        raise _unwritable(folder, error) from None
     return paths
+
+
+def _unwritable(folder: Path, error: OSError) -> InputError:
+    return InputError(f"--output {folder}: {error.strerror}; choose another folder")
 
 
 def json_content(latency: Latency) -> dict[str, Any]:

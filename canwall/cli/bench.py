@@ -27,6 +27,9 @@ from canwall.stopping import stop_on_signals
 if TYPE_CHECKING:
     from canwall.bench import Finding, Findings
 
+#: More busy processes or threads load no machine further; 100,000 take it down.
+_MOST_BUSY = 256
+
 
 def doctor(
     config_file: ConfigFile,
@@ -106,10 +109,15 @@ def latency(
     ] = 10.0,
     load: Annotated[
         int | None,
-        typer.Option(min=0, help="Busy processes of the load; without: one per core."),
+        typer.Option(
+            min=0, max=_MOST_BUSY, help="Busy processes of the load; without: one per core."
+        ),
     ] = None,
     threads: Annotated[
-        int, typer.Option(min=0, help="Busy Python threads in the process of the cycle.")
+        int,
+        typer.Option(
+            min=0, max=_MOST_BUSY, help="Busy Python threads in the process of the cycle."
+        ),
     ] = 0,
     exchange: Annotated[
         str | None, typer.Option(help="native, python-can or auto, instead of bus.exchange.")
@@ -133,8 +141,15 @@ def latency(
         drive__accept_no_watchdog=accept_no_watchdog or None,
     )
     from canwall.bench import measure_latency
-    from canwall.bench.latency_report import json_content, report_lines, write_latency
+    from canwall.bench.latency_report import (
+        json_content,
+        prepare_folder,
+        report_lines,
+        write_latency,
+    )
 
+    if output is not None:
+        prepare_folder(output)
     processes = os.cpu_count() or 1 if load is None else load
     with ProgressDisplay() as display, stop_on_signals() as stop:
         measured = measure_latency(
@@ -148,15 +163,16 @@ def latency(
     else:
         for line in report_lines(measured):
             console.print(line, soft_wrap=True, highlight=False)
-    if output is not None:
-        for path in write_latency(measured, output):
-            if not as_json:
-                console.print(str(path), soft_wrap=True, highlight=False)
-        if not is_installed("plot"):
-            say(f"no picture: {how_to_install('plot')}")
-    if as_json:
-        return failed
-    console.print(measured.shortest_cycle.text, soft_wrap=True, highlight=False)
+    try:
+        if output is not None:
+            for path in write_latency(measured, output):
+                if not as_json:
+                    console.print(str(path), soft_wrap=True, highlight=False)
+            if not is_installed("plot"):
+                say(f"no picture: {how_to_install('plot')}")
+    finally:
+        if not as_json:
+            console.print(measured.shortest_cycle.text, soft_wrap=True, highlight=False)
     return failed
 
 

@@ -5,7 +5,7 @@ The cycle writes into a ring in shared memory and never waits for a disk. A sepa
 """
 
 from canwall.record.columns import ROW, TIMING_COLUMNS, Phase, column_table
-from canwall.record.folder import RecordError, RunFolder, numbers, read_signals
+from canwall.record.folder import RecordError, RunFolder, numbers, read_signals, refuse_taken
 from canwall.record.mailbox import Mailbox
 from canwall.record.recorder import Recorder, Stream, start_recorders
 from canwall.record.ring import FRAME, Ring
@@ -26,5 +26,6 @@ __all__ = [
     "numbers",
     "parse_target",
     "read_signals",
+    "refuse_taken",
     "start_recorders",
 ]

@@ -4,7 +4,7 @@ import contextlib
 import fcntl
 import json
 import os
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -192,9 +192,7 @@ class RunFolder:
         try:
             folder.path.mkdir(parents=True, exist_ok=True)
             folder._remove_empty_record(bus_log)
-            for file in folder._files(bus_log):
-                if os.path.lexists(file):
-                    raise _taken(file)
+            refuse_taken(folder._files(bus_log))
             folder._claim(config)
         except OSError as error:
             raise ConfigError(
@@ -390,6 +388,13 @@ def lock_folder(path: Path) -> int | None:
         os.close(descriptor)
         return None
     return descriptor
+
+
+def refuse_taken(files: Iterable[Path]) -> None:
+    """Raise ConfigError if one of the files that are to be written is there already."""
+    for file in files:
+        if os.path.lexists(file):
+            raise _taken(file)
 
 
 def _taken(file: Path) -> ConfigError:

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from rig import eds_with
 
-from canwall import config, simdrive
+import canwall.bench
+from canwall import cli, config, simdrive
 from canwall.bench import latency as latency_module
 from canwall.bench.budget import Budget, BudgetFrame, bus_budget
 from canwall.bench.latency import Histogram, Latency, LatencyPhase, measure_latency, shortest_cycle
@@ -405,6 +407,8 @@ def test_command_that_cannot_put_the_drive_back(tmp_path: Path) -> None:
         (("--exchange", "other"), "bus.exchange"),
         (("--duration", "0"), "--duration"),
         (("--load", "-1"), "--load"),
+        (("--load", "257"), "--load"),
+        (("--threads", "257"), "--threads"),
     ],
 )
 def test_bad_input(arguments: tuple[str, ...], said: str) -> None:
@@ -412,6 +416,46 @@ def test_bad_input(arguments: tuple[str, ...], said: str) -> None:
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert said in line
+
+
+def test_output_is_checked_before_the_measurement(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setattr(canwall.bench, "measure_latency", lambda *args: pytest.fail("measured"))
+    taken = tmp_path / "latency.csv"
+    taken.write_text("mine")
+    for folder, said in (
+        (tmp_path, "holds latency.csv already; choose another --output"),
+        (taken, "File exists; choose another folder"),
+        (taken / "x", "Not a directory; choose another folder"),
+    ):
+        monkeypatch.setattr(sys, "argv", ["canwall", "latency", "--output", str(folder)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        assert ended.value.code == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.endswith(f"{folder}: {said}")
+    assert taken.read_text() == "mine"
+
+
+def test_verdict_is_told_whatever_the_output_does(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    folder = tmp_path / "out"
+
+    def lose_the_folder(*args: object) -> Latency:
+        folder.rmdir()
+        folder.touch()
+        return measured()
+
+    monkeypatch.setattr(canwall.bench, "measure_latency", lose_the_folder)
+    monkeypatch.setattr(sys, "argv", ["canwall", "latency", "--output", str(folder)])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 2
+    out, errors = capsys.readouterr()
+    assert out.splitlines()[-1] == measured().shortest_cycle.text
+    assert errors == f"canwall: --output {folder}: File exists; choose another folder\n"
 
 
 @pytest.mark.slow
