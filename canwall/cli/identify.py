@@ -55,12 +55,15 @@ def identify(
             from canwall.identify import identify as measure
             from canwall.identify import (
                 json_content,
+                refuse_report,
                 report_lines,
                 toml_fragment,
                 with_simulated_hand_still,
                 write_report,
             )
 
+            if output is not None:
+                refuse_report(output)
             if (
                 settings.embedded
                 and (still := with_simulated_hand_still(settings, hand)) != settings

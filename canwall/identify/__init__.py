@@ -3,7 +3,13 @@
 from canwall.identify.estimates import Estimate, ServoFit, Shaft, UntellingDataError
 from canwall.identify.fit import fit_servo
 from canwall.identify.hand import HandFit, fit_hand
-from canwall.identify.report import json_content, report_lines, toml_fragment, write_report
+from canwall.identify.report import (
+    json_content,
+    refuse_report,
+    report_lines,
+    toml_fragment,
+    write_report,
+)
 from canwall.identify.session import Identified, identify, with_simulated_hand_still
 
 __all__ = [
@@ -17,6 +23,7 @@ __all__ = [
     "fit_servo",
     "identify",
     "json_content",
+    "refuse_report",
     "report_lines",
     "toml_fragment",
     "with_simulated_hand_still",

@@ -14,7 +14,7 @@ from canwall.figure_style import COLOURS, DPI, PAGE_IN, STYLE
 from canwall.identify.estimates import Estimate, ServoFit
 from canwall.identify.hand import HandFit
 from canwall.identify.session import Identified, Measured
-from canwall.record import RecordError
+from canwall.record import RecordError, refuse_taken
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -154,6 +154,11 @@ def toml_fragment(found: Identified) -> str:
 def lag_is_known(servo: ServoFit) -> bool:
     """Return True if the lag of the current loop differs from none."""
     return servo.lag.low > 0.0
+
+
+def refuse_report(folder: Path) -> None:
+    """Raise ConfigError for a folder that holds a report already, before anything moves."""
+    refuse_taken(folder / f"identify.{ending}" for ending in ("txt", "json", "toml", "png"))
 
 
 def write_report(found: Identified, settings: Settings, inertia: float | None = None) -> list[Path]:

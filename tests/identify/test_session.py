@@ -1,6 +1,7 @@
 """The command, over the embedded bus: what it finds, writes and refuses, and how it ends."""
 
 import json
+import sys
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +14,8 @@ from rig import eds_with, settings_with
 
 from canwall import config
 from canwall.config import ConfigError, Settings
+from canwall import cli, config
+from canwall.config import Settings
 from canwall.identify import UntellingDataError, identify
 from canwall.identify.excitation import Bounds, HandExcitation
 from canwall.identify.session import Identification, stiction, with_simulated_hand_still
@@ -89,8 +92,23 @@ def test_drive_that_is_not_restored_is_a_failure(tmp_path: Path) -> None:
     done = command("identify", path, "--hand", "--output", tmp_path / "record")
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
-    assert line.startswith("canwall: node 5: not restored: node 5: writing 0x14 to 0x1800:03")
+    assert line.startswith("canwall: node 5: not restored: writing 0x14 to 0x1800:03")
     assert (tmp_path / "record/identify.json").exists()
+
+
+def test_report_that_is_there_is_kept(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Nothing is enabled: there would be a record."""
+    (tmp_path / "identify.toml").write_text("mine")
+    monkeypatch.setattr(sys, "argv", ["canwall", "identify", "--output", str(tmp_path)])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 2
+    said = f"canwall: {tmp_path}: holds identify.toml already; choose another --output\n"
+    assert capsys.readouterr().err == said
+    assert [path.name for path in tmp_path.iterdir()] == ["identify.toml"]
+    assert (tmp_path / "identify.toml").read_text() == "mine"
 
 
 @pytest.mark.slow
