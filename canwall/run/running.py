@@ -204,11 +204,13 @@ def check_together(many: Sequence[Settings]) -> None:
     first = many[0]
     for settings in many[1:]:
         for section in ("bus", "run"):
-            if getattr(settings, section) != getattr(first, section):
-                raise ConfigError(
-                    f"[{section}] differs between the configurations: drives that run together "
-                    "share the bus and its SYNC; make the sections equal"
-                )
+            ours, others = getattr(first, section), getattr(settings, section)
+            for key in type(ours).model_fields:
+                if getattr(ours, key) != getattr(others, key):
+                    raise ConfigError(
+                        f"{section}.{key} differs between the configurations: drives that run "
+                        f"together share the bus and its SYNC; make the [{section}] of all equal"
+                    )
     nodes = [settings.drive.node_id for settings in many]
     if len(set(nodes)) < len(nodes):
         raise ConfigError(f"drive.node_id: {nodes}: every drive needs one of its own")

@@ -92,8 +92,11 @@ def test_remarks_name_the_drive(tmp_path: Path) -> None:
     ("second", "message"),
     [
         (settings_of(5), "drive.node_id: [5, 5]: every drive needs one of its own"),
-        (settings_of(6, {"bus.cycle_s": 0.002}), "[bus] differs between the configurations"),
-        (settings_of(6, {"run.duration_s": 1.0}), "[run] differs between the configurations"),
+        (settings_of(6, {"bus.cycle_s": 0.002}), "bus.cycle_s differs between the configurations"),
+        (
+            settings_of(6, {"run.duration_s": 1.0}),
+            "run.duration_s differs between the configurations",
+        ),
     ],
 )
 def test_what_cannot_run_together(tmp_path: Path, second: Settings, message: str) -> None:
