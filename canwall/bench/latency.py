@@ -125,7 +125,7 @@ class ShortestCycle:
 class Latency:
     """Result of a measurement: its conditions, its phases, and the shortest cycle.
 
-    `not_restored` has a line for each change in the drive that could not be undone.
+    `not_restored` has a line if changes in the drive could not be undone.
     """
 
     interface: str

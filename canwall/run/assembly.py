@@ -144,8 +144,8 @@ def restoring_drives() -> Iterator[tuple[list[WallAxis], dict[str, list[str]]]]:
     """Undo the changes in the drives at the end, for each with `[drive] restore`.
 
     Yields a list to fill with the axes, and a dictionary that will hold, by name of the axis, a
-    line for each change that could not be undone. An error on the way has them as notes; Ctrl-C
-    becomes a DriveError.
+    line if changes could not be undone. An error on the way has it as a note; Ctrl-C becomes a
+    DriveError.
     """
     axes: list[WallAxis] = []
     failures: dict[str, list[str]] = {}
@@ -163,8 +163,14 @@ def _restore(axes: Sequence[WallAxis]) -> dict[str, list[str]]:
 
 
 def _restored(node: DriveNode) -> list[str]:
-    """Undo the changes in a drive; return a line for each that could not be undone."""
-    return [f"node {node.node_id}: not restored: {failure}" for failure in node.restore()]
+    """Undo the changes in a drive; return one line if any could not be undone."""
+    failures = node.restore()
+    if not failures:
+        return []
+    name = f"node {node.node_id}: "
+    more = f", and {len(failures) - 1} more" if len(failures) > 1 else ""
+    first = failures[0].removeprefix(name)
+    return [f"{name}not restored: {first}{more}; switch the drive off and on"]
 
 
 def _tell(error: BaseException, not_restored: Sequence[str]) -> None:

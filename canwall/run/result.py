@@ -43,7 +43,7 @@ class RunResult:
         outcome: How the loop ended.
         notes: What the record lacks.
         remarks: What the drive does not do as configured.
-        not_restored: Changes in the drive that `[drive] restore` could not undo.
+        not_restored: A line if `[drive] restore` could not undo changes in the drive.
     """
 
     folder: RunFolder

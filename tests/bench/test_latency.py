@@ -132,7 +132,7 @@ def test_stopped_in_between(drives: list[Listening]) -> None:
     assert {data for can_id, data in listening.heard if can_id == 0x205} == {bytes(4)}
 
 
-NOT_RESTORED = "node 5: not restored: node 5: writing 0x1 to 0x6007:00 failed"
+NOT_RESTORED = "node 5: not restored: writing 0x1 to 0x6007:00 failed"
 
 
 def test_what_cannot_be_put_back_is_said(drives: list[Listening]) -> None:
@@ -397,7 +397,7 @@ def test_command_that_cannot_put_the_drive_back(tmp_path: Path) -> None:
     done = command("latency", "--eds", eds, "--duration", "0.1", "--load", "0")
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
-    assert line.startswith("canwall: node 5: not restored: node 5: writing 0x14 to 0x1800:03")
+    assert line.startswith("canwall: node 5: not restored: writing 0x14 to 0x1800:03")
 
 
 @pytest.mark.parametrize(

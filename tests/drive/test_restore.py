@@ -1,15 +1,17 @@
 """`restore` undoes the changes of the set-up, and reports those that cannot be undone."""
 
 import contextlib
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 from canopen.objectdictionary import ODVariable
 from rig import Rig, RigFactory, settings_with
 
-from canwall.cycle import run_laws
+from canwall.cycle import WallAxis, run_laws
 from canwall.drive import DriveError, DriveNode
 from canwall.record import Ring
-from canwall.run import make_axis
+from canwall.run import make_axis, restoring_drives
 
 READ_ONLY = 0x06010002
 COMMANDS = ((0x6040, 0), (0x6041, 0), (0x6071, 0))
@@ -75,6 +77,20 @@ def test_what_cannot_be_put_back_is_said(make_rig: RigFactory) -> None:
     rig.tampering.read_only[(0x6007, 0)] = READ_ONLY
     (failure,) = rig.node.restore()
     assert "writing 0x1 to 0x6007:00 failed" in failure
+
+
+def test_many_that_cannot_be_put_back_are_one_line(make_rig: RigFactory) -> None:
+    rig = make_rig()
+    rig.set_up()
+    with restoring_drives() as (axes, not_restored):
+        settings = settings_with({"drive.restore": True})
+        axis = SimpleNamespace(name="the drive", node=rig.node, settings=settings)
+        axes.append(cast(WallAxis, axis))
+        rig.tampering.read_only |= {(0x6007, 0): READ_ONLY, (0x1800, 2): READ_ONLY}
+    (line,) = not_restored["the drive"]
+    assert line.startswith("node 5: not restored: writing 0x")
+    assert line.count("node 5") == 1
+    assert line.endswith(", and 1 more; switch the drive off and on")
 
 
 def test_parameters_come_before_what_depends_on_them(make_rig: RigFactory) -> None:

@@ -416,7 +416,7 @@ def test_drive_that_is_not_restored_is_a_failure(tmp_path: Path) -> None:
         "run", "--eds", eds, "--restore", "--duration", "0.1", "--output", tmp_path / "run"
     )
     assert done.returncode == 1
-    assert "node 5: not restored: node 5: writing 0x14 to 0x1800:03 failed" in done.stderr
+    assert "node 5: not restored: writing 0x14 to 0x1800:03 failed" in done.stderr
 
 
 @pytest.mark.slow

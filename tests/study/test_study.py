@@ -302,7 +302,7 @@ def test_a_drive_that_is_not_restored_is_told_in_the_end(
     person.type("q")
     code, _, errors = person.end()
     assert code == 1
-    assert errors.startswith("canwall: node 5: not restored: node 5: writing 0x14 to 0x1800:03")
+    assert errors.startswith("canwall: node 5: not restored: writing 0x14 to 0x1800:03")
 
 
 @pytest.mark.parametrize(("of_the_file", "first"), [("50.0", "5"), ("2.0", "2")])
