@@ -74,3 +74,5 @@ def test_wheel_has_what_belongs_to_it(installed: Path) -> None:
     assert modules == {path.relative_to(installed) for path in package.rglob("*.py")}
     assert (package / "py.typed").exists()
     assert not list(installed.glob("tests*"))
+    # The script and the module are the same start.
+    assert "from canwall.__main__ import main" in (installed / "bin" / "canwall").read_text()

@@ -3,6 +3,8 @@
 import gc
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Annotated, Any, NoReturn
 
 import typer
@@ -17,15 +19,26 @@ from canwall.supervised import given_up
 class _Commands(TyperGroup):
     """Commands in which Ctrl-C has words; typer would only make an exit code of it."""
 
+    def make_context(self, *arguments: Any, **options: Any) -> Any:
+        """Read the words of the command line."""
+        with _telling_of_ctrl_c():
+            return super().make_context(*arguments, **options)
+
     def invoke(self, context: Any) -> Any:
         """Call the command."""
-        try:
+        with _telling_of_ctrl_c():
             return super().invoke(context)
-        except KeyboardInterrupt as error:
-            stopped = StoppedError("interrupted")
-            for note in getattr(error, "__notes__", ()):
-                stopped.add_note(note)
-            raise stopped from error
+
+
+@contextmanager
+def _telling_of_ctrl_c() -> Iterator[None]:
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        stopped = StoppedError("interrupted")
+        for note in getattr(error, "__notes__", ()):
+            stopped.add_note(note)
+        raise stopped from error
 
 
 def make_program(**settings: Any) -> typer.Typer:

@@ -6,6 +6,7 @@ import os
 import shlex
 import subprocess
 import sys
+import tomllib
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import typer
 import xarray as xr
 from commands import COMMAND, PATIENCE_S, Record, command, config_file
 from rich.table import Table
+from typer.core import TyperGroup
 
 from canwall import cli, config
 from canwall.cli.completion import law_names
@@ -24,6 +26,7 @@ from canwall.errors import did_you_mean
 from canwall.sweep import read_sweep
 from canwall.walls import LAWS
 
+ROOT = Path(__file__).parents[2]
 PROGRAM: Any = typer.main.get_command(cli.app)
 
 
@@ -67,6 +70,50 @@ def test_as_a_module() -> None:
     words = [sys.executable, "-m", "canwall", "--version"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert (done.returncode, done.stdout) == (0, f"canwall {version('canwall')}\n")
+
+
+#: Interrupts the process as a module is looked for.
+INTERRUPTING = """\
+import os, signal, sys
+
+class Interrupt:
+    def find_spec(name, *more):
+        if name == os.environ["INTERRUPTED_AT"]:
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupt)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("at", ["canwall.cli", "typer", "canwall.supervised", "canwall.config"])
+@pytest.mark.parametrize("start", [("-m", "canwall"), ("-c", "import sys; sys.exit(main())")])
+def test_ctrl_c_during_the_start(tmp_path: Path, start: tuple[str, str], at: str) -> None:
+    (tmp_path / "sitecustomize.py").write_text(INTERRUPTING)
+    option, program = start
+    if option == "-c":  # as the script that is installed
+        project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+        module, function = project["scripts"]["canwall"].split(":")
+        program = f"from {module} import {function}\n{program}"
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, option, program, "run"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": path, "INTERRUPTED_AT": at},
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "canwall: interrupted\n")
+
+
+def test_ctrl_c_before_there_is_a_command(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*arguments: object, **options: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(TyperGroup, "make_context", interrupted)
+    assert run("run") == (130, "", "canwall: interrupted\n")
 
 
 @pytest.mark.slow
