@@ -79,12 +79,14 @@ def load(path: Path, overrides: Mapping[str, Any] | None = None) -> Settings:
     """
     path = located(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # of Notepad: with a byte-order mark
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; give the path of a configuration") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
-    except ValueError as error:  # for a NUL, and for what is no UTF-8
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: cannot be read: is not UTF-8; save it as UTF-8") from None
+    except ValueError as error:  # for a NUL
         raise ConfigError(f"{path}: cannot be read: {error}") from None
     return parse(text, path, overrides)
 
@@ -237,6 +239,8 @@ def first_error(error: ValidationError, model: type[BaseModel] = Settings) -> st
     hint = ""
     if first["type"] == "literal_error" and isinstance(given, str):
         hint = did_you_mean(given, re.findall(r"'([^']*)'", first["ctx"]["expected"]))
+    if first["type"] == "tuple_type" and isinstance(given, dict):
+        hint = f"; write [[{key}]]"
     expected = _TOML_TYPES.get(first["type"], message)
     return f"{begin}has to be {expected}, not {_format(given)}{hint}"
 
@@ -244,6 +248,8 @@ def first_error(error: ValidationError, model: type[BaseModel] = Settings) -> st
 def _format(value: object) -> str:
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
+    if isinstance(value, dict | list | tuple):
+        return _TOML_TYPES["dict_type" if isinstance(value, dict) else "tuple_type"]
     return repr(value) if isinstance(value, str | int | float | bool) else type(value).__name__
 
 

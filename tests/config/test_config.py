@@ -156,7 +156,7 @@ REFUSED: list[tuple[dict[str, object], str]] = [
     # wrong types
     ({"bus.cycle_s": "1 ms"}, "bus.cycle_s: has to be a valid number, not '1 ms'"),
     ({"bus.cycle_s": True}, "bus.cycle_s: has to be a valid number, not True"),
-    ({"bus.cycle_s": [0.001]}, "bus.cycle_s: has to be a valid number, not list"),
+    ({"bus.cycle_s": [0.001]}, "bus.cycle_s: has to be a valid number, not an array"),
     ({"bus.bitrate": 1e6}, "bus.bitrate: has to be a valid integer, not 1000000.0"),
     ({"bus.channel": 0}, "bus.channel: has to be a valid string, not 0"),
     ({"drive.node_id": "5"}, "drive.node_id: has to be a valid integer, not '5'"),
@@ -168,7 +168,12 @@ REFUSED: list[tuple[dict[str, object], str]] = [
     ({"wall": 3}, "wall: has to be a table, not 3"),
     ({"mechanics": 3}, "mechanics: has to be a table, not 3"),
     ({"schedule": 3}, "schedule: has to be an array, not 3"),
-    ({"schedule": {"at_s": 1.0}}, "schedule: has to be an array, not dict"),
+    ({"schedule": {"at_s": 1.0}}, "schedule: has to be an array, not a table; write [[schedule]]"),
+    (
+        {"simulation.fault": {"at_s": 1.0}},
+        "simulation.fault: has to be an array, not a table; write [[simulation.fault]]",
+    ),
+    ({"wall": [1]}, "wall: has to be a table, not an array"),
     ({"schedule": [3]}, "schedule.0: has to be a table, not 3"),
     # what is missing
     ({"drive": None}, "drive: is missing; add it"),
@@ -344,8 +349,14 @@ def test_what_is_not_toml(file: Path, text: str) -> None:
 
 
 def test_what_is_not_text(file: Path) -> None:
-    file.write_bytes(b"\xff\xfe\x00\x01")
-    assert refused(file).startswith("cannot be read: ")
+    for text in (b"\xff\xfe\x00\x01", "# Prüfstand".encode("latin-1")):
+        file.write_bytes(text)
+        assert refused(file) == "cannot be read: is not UTF-8; save it as UTF-8"
+
+
+def test_a_byte_order_mark_is_no_part_of_the_text(file: Path) -> None:
+    file.write_text(tomli_w.dumps(with_values({})), encoding="utf-8-sig")
+    assert load(file).drive.node_id
 
 
 def test_an_empty_file(file: Path) -> None:
