@@ -45,8 +45,8 @@ def sweep(
         typer.Option(
             metavar="NAME=VALUES",
             help="Any other axis: a key of the configuration, or delay, counts, torque_step, "
-            "model, model_error, delay_error, servo, friction, speed, phase, start, press, "
-            "press_torque, sync_jitter, stiffness_normalised, damping_normalised; "
+            "model, model_error, delay_error, servo, friction, breakaway, speed, phase, start, "
+            "press, press_torque, sync_jitter, stiffness_normalised, damping_normalised; "
             "VALUES: A,B,C or LO:HI:N.",
         ),
     ] = None,
@@ -82,7 +82,7 @@ def sweep(
             "--axis": axis,
             "--resume": resume,
         }
-        if given := ", ".join(option for option, value in unused.items() if value):
+        if given := ", ".join(option for option, value in unused.items() if value or value == ""):
             raise InputError(f"--table has fixed axes: leave out {given}")
         compute = partial(_compute_law_table, config_file, table, output, laws, operator)
         dataset = compute(through, workers, dask)
@@ -97,13 +97,13 @@ def sweep(
         raise InputError("--output is missing: give the FILE.nc of the result")
     axes = _parse_axes(axis or [])
     options = {
-        "law": laws,
+        "law": laws or None,
         "stiffness": stiffness,
         "damping": damping,
         "rate": rate,
         "operator": operator,
     }
-    axes |= {name: values for name, values in options.items() if values}
+    axes |= {name: values for name, values in options.items() if values is not None}
     settings = settings_from(config_file)
     from canwall.sweep import ineffective_axis_notes, make_plan, sweep_table
     from canwall.sweep import sweep as run_sweep

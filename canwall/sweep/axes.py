@@ -180,7 +180,8 @@ def _check(name: str, value: Value) -> None:
         return
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if not number or not math.isfinite(value):  # type: ignore[arg-type]
-        raise InputError(f"sweep axis {name}: has to be a number, not {value!r}")
+        hint = "; a range is LO:HI:N" if ":" in str(value) else ""
+        raise InputError(f"sweep axis {name}: has to be a number, not {value!r}{hint}")
     low = {"model_error": -1.0, "delay_error": -MAX_DELAY}.get(name, 0.0)
     low_allowed = name in _MAY_BE_ZERO
     if not (value > low or (low_allowed and value == low)):  # type: ignore[operator]

@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import typer
 from scipy import stats
 
 from canwall import cli, config
 from canwall.sweep import LAW_TABLES, law_tables, make_plan, read_sweep, sweep
+from canwall.sweep.axes import NAMED
 
 SERVO = config.shipped("config/sim.toml")
 
@@ -238,6 +240,21 @@ def test_unknown_table(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err == (
         "canwall: --table log: has to be one of laws, cap, bench, first-strike, shaft\n"
     )
+
+
+def test_an_axis_without_values_is_not_left_out(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert run("sweep", "--stiffness", "", "--output", str(tmp_path / "x.nc")) == 2
+    assert capsys.readouterr().err == "canwall: sweep axis stiffness: has no values\n"
+    assert run("sweep", "--stiffness", "", "--table", "laws") == 2
+    assert "leave out --stiffness" in capsys.readouterr().err
+
+
+def test_every_axis_is_in_the_help() -> None:
+    program: Any = typer.main.get_command(cli.app)
+    options = {option.name: option for option in program.commands["sweep"].params}
+    assert set(NAMED) - set(options) <= set(re.findall(r"\w+", options["axis"].help))
 
 
 def test_a_sweep_needs_a_file_for_its_result(capsys: pytest.CaptureFixture[str]) -> None:

@@ -557,7 +557,7 @@ def test_a_law_that_does_not_return_is_named_with_its_point(tmp_path: Path, thro
 @pytest.mark.parametrize(
     ("axes", "message"),
     [
-        ({"stiffness": "1:2"}, "axis stiffness: has to be a number, not '1:2'"),
+        ({"stiffness": "1:2"}, "axis stiffness: has to be a number, not '1:2'; a range is LO:HI:N"),
         ({"stiffness": "0:2:3"}, "a geometric range has to be above 0"),
         ({"stiffness": "1:2:0"}, "is not a range; write LO:HI:N"),
         ({"stiffness": "1,1"}, "axis stiffness: has a value twice"),
