@@ -5,7 +5,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from canwall.config import Settings
+from canwall.config import ConfigError, Settings
 from canwall.config import load as load_settings
 from canwall.extras import need
 from canwall.record import RunFolder
@@ -66,7 +66,12 @@ class RecordedRun:
     @cached_property
     def settings(self) -> Settings:
         """The configuration of the run, complete. Raises ConfigError if it cannot be read."""
-        return load_settings(RunFolder(self.folder).config)
+        config = RunFolder(self.folder).config
+        if not config.exists():
+            raise ConfigError(
+                f"{self.folder}: the record is incomplete: put back its {config.name}"
+            )
+        return load_settings(config)
 
     @property
     def chatter(self) -> bool:

@@ -3,6 +3,7 @@
 import importlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -237,6 +238,16 @@ def test_export_is_read_by_others(run: canwall.RecordedRun) -> None:
     assert [strike.law for strike in mat["summary"].strikes] == list(run.strikes["law"])
     assert np.isnan(mat["summary"].trip_cycle)
     assert mat["config"] == run.settings.to_toml()
+
+
+def test_export_of_a_record_without_its_configuration(
+    run: canwall.RecordedRun, tmp_path: Path
+) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(run.folder, folder, ignore=shutil.ignore_patterns("config.toml"))
+    with pytest.raises(InputError) as caught:
+        canwall.read(folder).to_mat()
+    assert str(caught.value) == f"{folder}: the record is incomplete: put back its config.toml"
 
 
 def test_export_asks_for_a_format(run: canwall.RecordedRun) -> None:
