@@ -277,7 +277,8 @@ def _write(path: Path, text: str) -> None:
     try:
         path.write_text(text, encoding="utf-8")
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be written: {error}") from None
+        why = getattr(error, "strerror", None) or str(error)
+        raise InputError(f"{path}: cannot be written: {why}; choose another --output") from None
 
 
 def _node_table(nodes: "list[BusNode]") -> Table:

@@ -157,6 +157,13 @@ def test_nothing_is_overwritten(tmp_path: Path, capfd: pytest.CaptureFixture[str
     assert file.read_text() == "mine"
 
 
+def test_file_that_cannot_be_written(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "nowhere" / "mine.toml"
+    assert refused(capfd, "config", "sim", "--output", file) == (
+        f"{file}: cannot be written: No such file or directory; choose another --output"
+    )
+
+
 def test_config_prints_what_runs(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         cli.app(["config", "sim"])
