@@ -16,6 +16,7 @@ from canwall.cli.options import (
     JsonOption,
     NoWatchdogOption,
     absolute_path,
+    folder_path,
     refuse_to_overwrite,
     settings_from,
 )
@@ -123,7 +124,10 @@ def latency(
         str | None, typer.Option(help="native, python-can or auto, instead of bus.exchange.")
     ] = None,
     output: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Folder for picture, histograms and numbers.")
+        Path | None,
+        typer.Option(
+            metavar="DIR", parser=folder_path, help="Folder for picture, histograms and numbers."
+        ),
     ] = None,
     eds: EdsOption = None,
     accept_no_watchdog: NoWatchdogOption = False,

@@ -13,6 +13,7 @@ from canwall.cli.options import (
     JsonOption,
     NoWatchdogOption,
     absolute_path,
+    folder_path,
     settings_from,
 )
 from canwall.cli.output import ProgressDisplay, console, print_json, say
@@ -32,7 +33,10 @@ def identify(
             min=1e-9, max=1e3, help="True inertia [kg·m²], for the scale of the torque constant."
         ),
     ] = None,
-    output: Annotated[Path | None, typer.Option(help="Folder of the record and report.")] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", parser=folder_path, help="Folder of the record and report."),
+    ] = None,
     eds: EdsOption = None,
     accept_no_watchdog: NoWatchdogOption = False,
     as_json: JsonOption = False,

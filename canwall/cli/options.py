@@ -57,6 +57,16 @@ def settings_from(path: Path | None, **overrides: Any) -> "Settings":
     return config.load(path or config.shipped("config/sim.toml"), dotted)
 
 
+def folder_path(text: str) -> Path:
+    """Parse --output; empty, as of a variable that is not set, it would be the working directory.
+
+    Raises BadParameter.
+    """
+    if not text:
+        raise typer.BadParameter("is empty; give a folder")
+    return Path(text)
+
+
 def refuse_to_overwrite(output: Path) -> None:
     """Raise InputError for a file that exists."""
     if output.is_file():

@@ -22,6 +22,7 @@ from canwall.cli.options import (
     JsonOption,
     NoWatchdogOption,
     absolute_path,
+    folder_path,
     settings_from,
 )
 from canwall.cli.output import ProgressDisplay, console, print_json, say
@@ -49,7 +50,10 @@ def run(
     stiffness: Annotated[float | None, typer.Option(help="Stiffness [N·m/rad].")] = None,
     damping: Annotated[float | None, typer.Option(help="Damping [N·m·s/rad].")] = None,
     duration: Annotated[float | None, typer.Option(help="Seconds; without: until Ctrl-C.")] = None,
-    output: Annotated[Path | None, typer.Option(help="Folder of the run's record.")] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", parser=folder_path, help="Folder of the run's record."),
+    ] = None,
     eds: EdsOption = None,
     accept_no_watchdog: NoWatchdogOption = False,
     restore: Annotated[

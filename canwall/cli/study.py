@@ -11,7 +11,7 @@ from rich.table import Table
 
 from canwall.cli.completion import complete_law
 from canwall.cli.ending import INTERRUPTED, failed_if
-from canwall.cli.options import ConfigFile, JsonOption, settings_from
+from canwall.cli.options import ConfigFile, JsonOption, folder_path, settings_from
 from canwall.cli.output import console, print_json
 from canwall.cli.program import make_program
 from canwall.extras import need
@@ -25,7 +25,9 @@ study = make_program(
     help="Let a person at the handle judge walls, free of chatter or not.",
 )
 
-_Output = Annotated[Path, typer.Option(metavar="DIR", help="Folder of the session.")]
+_Output = Annotated[
+    Path, typer.Option(metavar="DIR", parser=folder_path, help="Folder of the session.")
+]
 _Laws = Annotated[
     list[str] | None,
     typer.Option(

@@ -188,6 +188,7 @@ def nothing_but_boot_up(listener: VirtualBus) -> bool:
         (["--law", "none.py:none"], "none.py"),
         (["--stiffness", "-1"], "wall.stiffness_nm_per_rad: has to be greater than or equal to 0"),
         (["--duration", "0"], "run.duration_s: has to be greater than 0"),
+        (["--output", ""], "Invalid value for '--output': is empty; give a folder"),
         (["--output", "bad.toml"], "bad.toml: cannot be written"),
         (["--output", "taken"], "taken: holds signals.parquet already; choose another --output"),
     ],
