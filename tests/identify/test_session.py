@@ -12,10 +12,8 @@ import pytest
 from commands import command, config_file
 from rig import eds_with, settings_with
 
-from canwall import config
-from canwall.config import ConfigError, Settings
 from canwall import cli, config
-from canwall.config import Settings
+from canwall.config import ConfigError, Settings
 from canwall.identify import UntellingDataError, identify
 from canwall.identify.excitation import Bounds, HandExcitation
 from canwall.identify.session import Identification, stiction, with_simulated_hand_still
