@@ -3,6 +3,7 @@
 import math
 import threading
 from dataclasses import dataclass
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -329,7 +330,7 @@ class PreparedStrike:
             Measures of each strike, shape (n,), dtype MEASURES.
 
         Raises:
-            RunFailedError: If the law raises.
+            RunFailedError: If the law raises, or returns no finite number.
         """
         measures = np.zeros(len(walls), MEASURES)
         if self._by_frames:
@@ -350,18 +351,18 @@ class PreparedStrike:
                 measures,
             )
         for wall in walls[measures["trip"] == Trip.NOT_A_NUMBER][:1]:
-            self._refuse_what_raises(*wall.tolist())
+            self._refuse_failed_law(*wall.tolist())
         return measures
 
-    def _refuse_what_raises(self, stiffness: float, damping: float) -> None:
-        """Raise RunFailedError if the law has raised on this wall: that is no limit of it."""
+    def _refuse_failed_law(self, stiffness: float, damping: float) -> NoReturn:
+        """Raise RunFailedError for a law that failed on this wall: that is no limit of it."""
         self._repeat(stiffness, damping)
         law = run_laws(self._settings)[0]
-        if failure := law.failure(self._loop.cycle["rendered"]["wall"].reshape(1)):
-            raise RunFailedError(
-                f"{_shown(stiffness, damping)}: cycle {self.progress}: law {law.name} raised "
-                f"{failure}"
-            )
+        failure = law.failure(self._loop.cycle["rendered"]["wall"].reshape(1))
+        what = f"raised {failure}" if failure else "gave a force that is not a number"
+        raise RunFailedError(
+            f"{_shown(stiffness, damping)}: cycle {self.progress}: law {law.name} {what}"
+        )
 
     def motion(self, stiffness: float, damping: float) -> StrikeMotion:
         """Strike a wall of this stiffness [N·m/rad] and damping [N·m·s/rad], in memory."""

@@ -5,6 +5,8 @@ wall and not yet got back, at the instants at which the forces take effect. It e
 contact: energy left over from one must not make the next one active.
 """
 
+import math
+
 from canwall.compiled import Record, compiled
 from canwall.walls.interface import call_law, free_step
 
@@ -21,7 +23,8 @@ def wall_force(address: int, wall: Record) -> float:
     wall.referent[0].wall_damping = wall.damping
     _observe_energy(wall)
     force = call_law(address, wall)
-    if force < 0.0:
+    # Of -inf a policy would make 0, and nobody would learn of it.
+    if -math.inf < force < 0.0:
         force = _tension(wall, force)
     if wall.passivity_damping > 0.0:
         force = _passivity_control(wall, force)

@@ -700,13 +700,14 @@ def test_drive_that_is_not_enabled(statusword: int) -> None:
     assert wall.trip() == Trip.NOT_ENABLED
 
 
+@pytest.mark.parametrize("tension", ["allow", "clamp", "budget"])
 @pytest.mark.parametrize("value", ["math.nan", "math.inf", "-math.inf"])
-def test_law_whose_force_is_not_a_number(tmp_path: Path, value: str) -> None:
+def test_law_whose_force_is_not_a_number(tmp_path: Path, value: str, tension: str) -> None:
     file = tmp_path / "wrong.py"
     file.write_text(
         f"import math\n\ndef wrong(wall):\n    return {value} if wall.y_sample < 0.0 else 0.0\n"
     )
-    wall = Wall({"wall.law": f"{file}:wrong"})
+    wall = Wall({"wall.law": f"{file}:wrong", "wall.tension": tension})
     assert wall.at(1) == 0
     assert wall.trip() == Trip.NONE
     assert wall.at(-10) == 0

@@ -525,6 +525,25 @@ def test_a_law_that_raises_is_named_with_its_wall(tmp_path: Path, stiffness: lis
     )
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("force", ["math.nan", "-math.inf"])
+def test_a_law_whose_force_is_no_number_is_named_with_its_wall(tmp_path: Path, force: str) -> None:
+    law = tmp_path / "laws.py"
+    law.write_text(
+        f"import math\n\ndef endless(wall):\n    return {force} if wall.y < 0.0 else 0.0\n"
+    )
+    done = command(
+        *("sweep", settings_file(), "--output", tmp_path / "a.nc", "--law", f"{law}:endless"),
+        *("--axis", "speed=1", "--axis", "phase=0", "--stiffness", "20"),
+    )
+    assert done.returncode == 1
+    assert re.fullmatch(
+        r"canwall: .*stiffness 20, damping 0: cycle \d+: law \S+laws.py:endless gave a force that "
+        r"is not a number; --resume continues \S+\n",
+        done.stderr,
+    )
+
+
 HANGING = """def hanging(wall):
     '''Does not return from walls that are stiff.'''
     if wall.stiffness > 50.0:
