@@ -28,7 +28,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from canwall.errors import did_you_mean
-from canwall.walls.interface import MAX_OPTIONS, Law, UnknownLawError, wall_with
+from canwall.walls.interface import MAX_OPTIONS, WALL, Law, UnknownLawError, wall_with
 
 
 def load_law(path: Path, function: str) -> Law:
@@ -164,8 +164,10 @@ def _check_types(compiled: Any) -> None:
                 f"line {block.terminator.loc.line}: returns {_shown_type(kind)}; a law returns a "
                 f"number, on every way through it"
             )
-    _refuse_positions(annotation)
-    _refuse_changes(annotation)
+    for function in _with_callees(annotation):
+        _refuse_positions(function)
+    for function in _with_callees(annotation):
+        _refuse_changes(function)
 
 
 def _returned_type(block: Any, returned: Any, typemap: Mapping[str, Any]) -> Any:
@@ -187,8 +189,20 @@ def _shown_type(kind: Any) -> str:
     return "a string" if kind == types.unicode_type else str(kind)
 
 
+def _with_callees(annotation: Any) -> list[Any]:
+    """Return a function and the functions that it calls, as far as they were compiled here."""
+    found = [annotation]
+    for function in found:  # which grows meanwhile
+        for kind in function.typemap.values():
+            if isinstance(kind, types.Dispatcher):
+                called = [c.type_annotation for c in kind.dispatcher.overloads.values()]
+                # What was loaded from disk has no blocks.
+                found += [c for c in called if hasattr(c, "blocks") and c not in found]
+    return found
+
+
 def _refuse_positions(annotation: Any) -> None:
-    """Refuse `wall.options[0]`, in the functions that the law calls as well.
+    """Refuse `wall.options[0]`.
 
     The order of the options is that of their declaration, which nothing else depends on.
     """
@@ -207,22 +221,52 @@ def _refuse_positions(annotation: Any) -> None:
                     f"line {access.loc.line}: uses a field by its position; use its name, "
                     f"wall.options.NAME"
                 )
-    for kind in typemap.values():
-        if isinstance(kind, types.Dispatcher):
-            for callee in kind.dispatcher.overloads.values():
-                if hasattr(callee.type_annotation, "blocks"):  # not if it was loaded from disk
-                    _refuse_positions(callee.type_annotation)
 
 
 def _refuse_changes(annotation: Any) -> None:
     """Refuse `wall.period = 1.0`, which would stay, and hold for the laws after it as well."""
     for block in annotation.blocks.values():
-        for change in block.find_insts(ir.SetAttr):
-            if isinstance(annotation.typemap[change.target.name], types.Record):
+        changes = [
+            *block.find_insts(ir.SetAttr | ir.StaticSetItem | ir.SetItem),
+            *block.find_exprs("inplace_binop"),
+        ]
+        for change in changes:
+            if field := _changed_field(annotation, change):
                 raise UnsuitableLawError(
-                    f"line {change.loc.line}: changes {change.attr}; a law reads the wall, and "
+                    f"line {change.loc.line}: changes {field}; a law reads the wall, and "
                     f"keeps numbers of its own in wall.memory"
                 )
+
+
+#: Arrays of the wall that a law only reads, by type: `memory` and `plan` have others.
+_READ_ONLY = {from_dtype(WALL).fields[name].type: name for name in ("phi", "gamma", "referent")}
+#: Expressions whose value is a part of another one, or the same.
+_PARTS = ("getattr", "getitem", "static_getitem", "getiter", "iternext", "pair_first", "cast")
+
+
+def _changed_field(annotation: Any, change: Any) -> str:
+    """Return the field of the wall that an instruction changes and must not; empty if none.
+
+    What is changed may be a part of the field, as in `wall.phi[0][1] = 5.0`.
+    """
+    typemap = annotation.typemap
+    target = change.lhs if isinstance(change, ir.Expr) else change.target
+    if isinstance(typemap[target.name], types.Record):
+        return str(change.attr if isinstance(change, ir.SetAttr) else change.index)
+    if not isinstance(typemap[target.name], types.Array):
+        return ""  # a number that was read, as in `y += 1.0`
+    values = {
+        assignment.target.name: assignment.value
+        for block in annotation.blocks.values()
+        for assignment in block.find_insts(ir.Assign)
+    }
+    while isinstance(target, ir.Var):
+        if field := _READ_ONLY.get(typemap[target.name]):
+            return field
+        value = values.pop(target.name, None)
+        is_part = isinstance(value, ir.Expr) and value.op in _PARTS
+        target = value.value if is_part else value
+    return ""
 
 
 class _Guarded:

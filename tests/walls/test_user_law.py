@@ -280,6 +280,78 @@ def test_fields_are_not_read_by_position(write: Write, line: int, text: str) -> 
     assert str(caught.value).startswith(f"{name}: line {line}: uses a field by its position; use")
 
 
+@pytest.mark.parametrize(
+    ("field", "change"),
+    [
+        ("gamma", "wall.gamma[1] = 0.0"),
+        ("phi", "wall.phi[0, 0] = 5.0"),
+        ("phi", "wall.phi[0][1] = 5.0"),
+        ("phi", "wall.phi[int(wall.y)][:] = 5.0"),
+        ("phi", "for row in wall.phi: row[0] = 5.0"),
+        ("gamma", "g = wall.gamma; g += 1.0"),
+        ("gamma", "wall['gamma'][0] = 1.0"),
+        ("period", "wall['period'] = 1.0"),
+        ("mass", "wall.referent[0].mass = 1.0"),
+        ("growth", "wall.options['growth'] = 2.0"),
+    ],
+)
+def test_a_law_does_not_change_the_wall(write: Write, field: str, change: str) -> None:
+    """Neither does a function that it calls, with the wall or with an array of it."""
+    begin = "from numba import njit\nOPTIONS = {'growth': 1}\n"
+    for text in (
+        f"\n\ndef mine(wall):\n    {change}\n    return 0.0\n",
+        f"@njit\ndef sneak(wall):\n    z = 0.0\n    {change}\n"
+        "def mine(wall):\n    sneak(wall)\n    return 0.0\n",
+    ):
+        name = write(begin + text)
+        with pytest.raises(UnknownLawError) as caught:
+            find_law(name)
+        line = (begin + text)[: (begin + text).index(change)].count("\n") + 1
+        assert str(caught.value) == (
+            f"{name}: line {line}: changes {field}; a law reads the wall, and keeps numbers of its "
+            "own in wall.memory"
+        )
+
+
+def test_an_array_of_the_wall_is_not_changed_by_a_function_that_gets_it(write: Write) -> None:
+    put = "from numba import njit\n@njit\ndef put(numbers):\n    numbers[1] = 2.0\n"
+    name = write(put + "def mine(wall):\n    put(wall.gamma)\n    return 0.0\n")
+    with pytest.raises(UnknownLawError, match=r"mine: line 4: changes gamma; a law reads the wall"):
+        find_law(name)
+
+
+@pytest.mark.slow
+def test_a_law_writes_its_memory_and_arrays_of_its_own(write: Write) -> None:
+    found = find_law(
+        write(
+            "import numpy as np\n"
+            "from numba import njit\n"
+            "@njit\n"
+            "def put(numbers):\n"
+            "    numbers[1] = 2.0\n"
+            "def mine(wall):\n"
+            "    put(wall.memory)\n"
+            "    kept = wall.plan[2:]\n"
+            "    kept[0] += 3.0\n"
+            "    wall['plan'][0] = 4.0\n"
+            "    gamma = wall.gamma.copy()\n"
+            "    gamma[0] = 5.0\n"
+            "    phi = 2.0 * wall.phi\n"
+            "    phi[0, 0] += 6.0\n"
+            "    own = np.zeros(2)\n"
+            "    own[:] = wall.gamma\n"
+            "    y = wall.phi[0, 0]\n"
+            "    y += 1.0\n"
+            "    return gamma[0] + phi[0, 0] + y\n"
+        )
+    )
+    wall = np.zeros(1, WALL)
+    assert wall_force(found.address, wall[0]) == 12.0
+    assert wall["memory"][0, 1] == 2.0
+    assert wall["plan"][0, :3].tolist() == [4.0, 0.0, 3.0]
+    assert not wall["gamma"].any()
+
+
 def test_one_line_for_a_file_that_is_not_there(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("def mine(wall):\n    return 0.0\n")
     for file, complaint in (
