@@ -18,6 +18,19 @@ given_up: list[threading.Thread] = []
 """Threads that may still be running; only the end of the process ends them."""
 
 
+def interruptible(function: Callable[[], object]) -> None:
+    """Call a function in a thread of its own, which Ctrl-C leaves behind."""
+    call = Call(function, lambda: None)
+    try:
+        while not call.has_ended():
+            pass
+    except KeyboardInterrupt:
+        call.give_up()
+        raise
+    if call.error is not None:
+        raise call.error
+
+
 class Call:
     """A call in a thread of its own.
 

@@ -3,6 +3,7 @@
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar
@@ -217,15 +218,20 @@ def _check_values(plan: Plan) -> None:
         plan.settings(first, other)
 
 
-def compute_piece(plan: Plan, piece: int) -> NDArray[np.void]:
+def compute_piece(
+    plan: Plan, piece: int, is_abandoned: Callable[[], bool] = lambda: False
+) -> NDArray[np.void]:
     """Compute a piece of work; shape (strikes, walls), dtype of the plan.
 
-    Raises RunFailedError if a law does not return; the thread that evaluates it is left behind.
+    Raises RunFailedError if a law does not return, and CancelledError once nobody waits for the
+    piece; the thread that computes it is left behind.
     """
     condition, strikes, walls = plan.slices(piece)
     point, chosen = plan.points[condition], plan.strikes[strikes]
     prepared = [plan.prepare(point, strike) for strike in chosen]
-    return _supervised(lambda: _strike(plan, prepared, walls), prepared, point, chosen)
+    return _supervised(
+        lambda: _strike(plan, prepared, walls), prepared, point, chosen, is_abandoned
+    )
 
 
 def repeat_strike(
@@ -264,10 +270,12 @@ def _supervised(
     prepared: Sequence[PreparedStrike],
     point: Mapping[str, Value],
     strikes: Sequence[Mapping[str, Value]],
+    is_abandoned: Callable[[], bool] = lambda: False,
 ) -> _T:
     """Return what a computation with these strikes does.
 
-    Raises RunFailedError if a law does not return; the thread that evaluates it is left behind.
+    Raises RunFailedError if a law does not return, and CancelledError once it is abandoned; the
+    thread that computes is left behind.
     """
     computed: list[_T] = []
     call = Call(
@@ -275,6 +283,9 @@ def _supervised(
         lambda: [strike.progress for strike in prepared],
     )
     while not call.has_ended():
+        if is_abandoned():
+            call.give_up()
+            raise CancelledError
         if call.computed_s < _LAW_S:
             continue
         for strike, at in zip(prepared, strikes, strict=True):

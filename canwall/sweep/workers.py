@@ -4,7 +4,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import (
     BrokenExecutor,
     Executor,
@@ -12,7 +12,10 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     as_completed,
 )
+from functools import partial
 
+import numpy as np
+from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from canwall.errors import RunFailedError
@@ -42,7 +45,9 @@ def compute_pieces(
         # Frames are handled by the interpreter, so threads would share one lock.
         context = multiprocessing.get_context("spawn")
         return _compute_in_pool(plan, pieces, ProcessPoolExecutor(count, context, _init_process))
-    return _compute_in_pool(plan, pieces, ThreadPoolExecutor(count))
+    abandoned = threading.Event()
+    compute = partial(compute_piece, is_abandoned=abandoned.is_set)
+    return _compute_in_pool(plan, pieces, ThreadPoolExecutor(count), compute, abandoned.set)
 
 
 def _init_process() -> None:
@@ -68,12 +73,22 @@ def _limit_blas_threads() -> threadpool_limits:
     return threadpool_limits(1, user_api="blas")
 
 
-def _compute_in_pool(plan: Plan, pieces: Sequence[int], pool: Executor) -> Iterator[PieceResult]:
+def _compute_in_pool(
+    plan: Plan,
+    pieces: Sequence[int],
+    pool: Executor,
+    compute: Callable[[Plan, int], NDArray[np.void]] = compute_piece,
+    abandon: Callable[[], object] = lambda: None,
+) -> Iterator[PieceResult]:
     with _limit_blas_threads():
         try:
-            jobs = {pool.submit(compute_piece, plan, piece): piece for piece in pieces}
+            jobs = {pool.submit(compute, plan, piece): piece for piece in pieces}
             for job in as_completed(jobs):
                 yield jobs[job], job.result()
+        except (KeyboardInterrupt, GeneratorExit):
+            # A piece may take as long as a slow law likes.
+            abandon()
+            raise
         except BrokenExecutor:
             raise RunFailedError("a process that computes the sweep has died") from None
         finally:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from canwall.compiled import Record, compiled
 from canwall.errors import InputError, RunFailedError, did_you_mean
 from canwall.physics import advance, make_plant
+from canwall.supervised import interruptible
 from canwall.walls import (
     TENSION,
     WALL,
@@ -177,7 +178,8 @@ def sampled_ball(
     wall["passivity_damping"] = ball.passivity
     wall["d"] = -ball.mass * ball.gravity
     trajectory = np.zeros((3, ball.periods + 1))
-    bounce(wall, law.address, ball.height, ball.speed, trajectory)
+    # A law of the user's may not return.
+    interruptible(lambda: bounce(wall, law.address, ball.height, ball.speed, trajectory))
     return trajectory[0], trajectory[1], trajectory[2]
 
 
