@@ -43,7 +43,15 @@ def load_law(path: Path, function: str) -> Law:
     try:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:  # whatever the user's file does when it is run
-        raise UnknownLawError(f"{where}: {type(error).__name__}: {_gist(error)}") from None
+        lines = [
+            f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == spec.origin
+        ]
+        line = f"line {lines[-1]}: " if lines else ""  # a SyntaxError's is in its text
+        beside = isinstance(error, ModuleNotFoundError) and _is_beside(path, error.name)
+        remedy = "; a law is one file: write into it what it needs" if beside else ""
+        raise UnknownLawError(
+            f"{where}: {line}{type(error).__name__}: {_gist(error)}{remedy}"
+        ) from None
     written = getattr(module, function, None)
     if isinstance(written, Law):
         raise UnknownLawError(
@@ -55,6 +63,12 @@ def load_law(path: Path, function: str) -> Law:
     if not isinstance(written, FunctionType):
         raise UnknownLawError(f"{where}: the file has no such function")
     return make_law(where, written, getattr(module, "OPTIONS", {}))
+
+
+def _is_beside(path: Path, module: str | None) -> bool:
+    """Return True for a module that stands in the folder of a law's file."""
+    beside = path.parent / (module or "").partition(".")[0]
+    return bool(module) and (beside.is_dir() or beside.with_suffix(".py").is_file())
 
 
 def make_law(name: str, written: FunctionType, options: object) -> Law:

@@ -187,7 +187,7 @@ def test_options_may_be_numbers_of_numpy(write: Write) -> None:
             "line 3: changes growth; a law reads the wall",
         ),
         ("def mine(wall)\n    return 0.0\n", "SyntaxError: expected ':' (mine.py, line 1)"),
-        ("import nowhere\n", "ModuleNotFoundError: No module named 'nowhere'"),
+        ("\nimport nowhere\n", "line 2: ModuleNotFoundError: No module named 'nowhere'"),
         ("def mine(wall):\n    pass\n", "line 2: returns None; a law returns a number"),
         ("def mine(wall):\n    raise ValueError\n", "returns on no way through it; a law returns"),
         (
@@ -229,7 +229,10 @@ def test_options_may_be_numbers_of_numpy(write: Write) -> None:
             "line 2: uses wall.options, but declares no OPTIONS",
         ),
         ("def mine(wall, y):\n    return y\n", "takes 2 arguments; a law takes one, the wall"),
-        ("import math\nmath.nowhere\n", "AttributeError: module 'math' has no attribute 'nowhere'"),
+        (
+            "import math\ndef wrong():\n    math.nowhere\nwrong()\n",
+            "line 3: AttributeError: module 'math' has no attribute 'nowhere'",
+        ),
         ("OPTIONS = ['a']\ndef mine(wall):\n    return 0.0\n", "OPTIONS "),
         (
             "OPTIONS = {'a': 'b'}\ndef mine(wall):\n    return 0.0\n",
@@ -278,6 +281,17 @@ def test_fields_are_not_read_by_position(write: Write, line: int, text: str) -> 
     with pytest.raises(UnknownLawError) as caught:
         find_law(name)
     assert str(caught.value).startswith(f"{name}: line {line}: uses a field by its position; use")
+
+
+def test_a_law_is_one_file(write: Write, tmp_path: Path) -> None:
+    (tmp_path / "helpers.py").write_text("GROWTH = 2.0\n")
+    name = write("from helpers import GROWTH\ndef mine(wall):\n    return GROWTH\n")
+    with pytest.raises(UnknownLawError) as caught:
+        find_law(name)
+    assert str(caught.value) == (
+        f"{name}: line 1: ModuleNotFoundError: No module named 'helpers'; a law is one file: "
+        "write into it what it needs"
+    )
 
 
 @pytest.mark.parametrize(
