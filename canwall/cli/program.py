@@ -3,8 +3,6 @@
 import gc
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Annotated, Any, NoReturn
 
 import typer
@@ -21,24 +19,24 @@ class _Commands(TyperGroup):
 
     def make_context(self, *arguments: Any, **options: Any) -> Any:
         """Read the words of the command line."""
-        with _telling_of_ctrl_c():
+        try:
             return super().make_context(*arguments, **options)
+        except KeyboardInterrupt as error:
+            raise _stopped(error) from error
 
     def invoke(self, context: Any) -> Any:
         """Call the command."""
-        with _telling_of_ctrl_c():
+        try:
             return super().invoke(context)
+        except KeyboardInterrupt as error:
+            raise _stopped(error) from error
 
 
-@contextmanager
-def _telling_of_ctrl_c() -> Iterator[None]:
-    try:
-        yield
-    except KeyboardInterrupt as error:
-        stopped = StoppedError("interrupted")
-        for note in getattr(error, "__notes__", ()):
-            stopped.add_note(note)
-        raise stopped from error
+def _stopped(error: KeyboardInterrupt) -> StoppedError:
+    stopped = StoppedError("interrupted")
+    for note in getattr(error, "__notes__", ()):
+        stopped.add_note(note)
+    return stopped
 
 
 def make_program(**settings: Any) -> typer.Typer:
