@@ -91,7 +91,7 @@ def run_program(program: typer.Typer) -> NoReturn:
     # At its end Python looks for garbage among all that was ever imported, for longer than a
     # command may take; all of it goes with the process.
     gc.freeze()
-    if given_up:
+    if any(thread.is_alive() for thread in given_up):
         # A thread still computes with memory that Python would free.
         sys.stdout.flush()
         sys.stderr.flush()

@@ -1,6 +1,8 @@
 """`canwall ball`: its file, its line, its errors."""
 
+import os
 import sys
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -89,6 +91,18 @@ def test_energy_that_is_not_kept(bounce: Bounce, law: str, end: float) -> None:
     said = bounce("--law", law)
     assert end_over_start(bounce.columns()) == pytest.approx(end, rel=1e-5)
     assert f"energy 1 J at the start, {end:.4f}" in said.out
+
+
+def test_thread_that_was_left_behind_and_has_ended(
+    bounce: Bounce, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Python ends as usual: nothing computes any more."""
+    ended = threading.Thread(target=lambda: None)
+    ended.start()
+    ended.join()
+    monkeypatch.setattr("canwall.cli.program.given_up", [ended])
+    monkeypatch.setattr(os, "_exit", lambda code: pytest.fail("ended at once"))
+    assert bounce().code == 0
 
 
 def test_every_option_reaches_the_ball(bounce: Bounce) -> None:
