@@ -102,7 +102,7 @@ def test_thread_that_was_left_behind_and_has_ended(
     ended.join()
     monkeypatch.setattr("canwall.cli.program.given_up", [ended])
     monkeypatch.setattr(os, "_exit", lambda code: pytest.fail("ended at once"))
-    assert bounce().code == 0
+    assert bounce("--law", "mean_force").code == 0
 
 
 def test_every_option_reaches_the_ball(bounce: Bounce) -> None:
