@@ -3,6 +3,7 @@
 import gc
 import os
 import sys
+import threading
 from typing import Annotated, Any, NoReturn
 
 import typer
@@ -91,7 +92,7 @@ def run_program(program: typer.Typer) -> NoReturn:
     # At its end Python looks for garbage among all that was ever imported, for longer than a
     # command may take; all of it goes with the process.
     gc.freeze()
-    if any(thread.is_alive() for thread in given_up):
+    if any(map(threading.Thread.is_alive, given_up)):
         # A thread still computes with memory that Python would free.
         sys.stdout.flush()
         sys.stderr.flush()
