@@ -6,10 +6,9 @@ Nothing that takes long is imported before Ctrl-C has its words.
 import contextlib
 import os
 import signal
-import sys
 from typing import NoReturn
 
-_INTERRUPTED = 130
+from canwall.stopping import INTERRUPTED, end_at_once
 
 
 def main() -> NoReturn:
@@ -28,27 +27,17 @@ def main() -> NoReturn:
     except KeyboardInterrupt:  # before there is a command, or after it
         _interrupted()
     except SystemExit as end:
-        if end.code == _INTERRUPTED:
-            _end()
+        if end.code == INTERRUPTED:
+            # Python itself would end by the signal, without a code, if it came during the exec of a
+            # text, as dataclasses have them.
+            end_at_once(INTERRUPTED)
         raise
 
 
 def _interrupted() -> NoReturn:
     with contextlib.suppress(OSError):
         os.write(2, b"canwall: interrupted\n")
-    _end()
-
-
-def _end() -> NoReturn:
-    """End with the exit code of Ctrl-C.
-
-    Python itself would end by the signal, without a code, if it came during the exec of a text, as
-    dataclasses have them.
-    """
-    for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(AttributeError, OSError, ValueError):  # closed, or none
-            stream.flush()
-    os._exit(_INTERRUPTED)
+    end_at_once(INTERRUPTED)
 
 
 if __name__ == "__main__":

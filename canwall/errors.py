@@ -2,7 +2,7 @@
 
 import difflib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 #: Longest word and longest text of a message, which may quote what it is about [characters].
@@ -60,3 +60,9 @@ class TrippedError(RunFailedError):
 
 class RunWarning(UserWarning):
     """Something that a run could not complete: a part of its record, or the drive put back."""
+
+
+def first_of(failures: Sequence[str]) -> str:
+    """Return the first of several failures, and how many more there are, in one line."""
+    more = f", and {len(failures) - 1} more" if len(failures) > 1 else ""
+    return f"{failures[0]}{more}"

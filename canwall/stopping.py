@@ -1,8 +1,14 @@
-"""Signals that request the end of a run, so that the drive is disabled first."""
+"""Signals that request the end of a run, so that the drive is disabled first; the end at once."""
 
+import os
 import signal
+import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from typing import NoReturn
+
+#: Exit code of what Ctrl-C has ended, with the drive disabled.
+INTERRUPTED = 130
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -71,3 +77,11 @@ def stop_on_signals(held: bool = True) -> Iterator[StopRequest]:
         _in_force.remove(stop)
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+def end_at_once(code: int) -> NoReturn:
+    """End the process with an exit code; what has been printed is told, nothing else is done."""
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(AttributeError, OSError, ValueError):  # closed, or none
+            stream.flush()
+    os._exit(code)

@@ -51,7 +51,7 @@ def describe_setup(
     if setup.scales is not None:
         for found, whence in setup.scales.sources:
             findings.add("units", whence, found)
-        _compare_rated_torque(node, setup, settings.drive, findings)
+        _compare_rated_torque(node, settings.drive, findings)
     findings.add("PDO", "TPDO, with every SYNC", _shown(setup.tpdo))
     effect = "at the next SYNC" if setup.synchronous else "on reception"
     findings.add("PDO", f"RPDO, effective {effect}", _shown(setup.rpdo))
@@ -75,9 +75,7 @@ def describe_setup(
         findings.add("watchdog", "passed over", passed_over)
 
 
-def _compare_rated_torque(
-    node: DriveNode, setup: DriveSetup, settings: DriveSettings, findings: Findings
-) -> None:
+def _compare_rated_torque(node: DriveNode, settings: DriveSettings, findings: Findings) -> None:
     """Doubt a rated torque that was given and is far from 0x6076, in whatever unit that is."""
     given = settings.rated_torque_nm
     if given is None or not node.has(od.MOTOR_RATED_TORQUE):

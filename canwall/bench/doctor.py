@@ -24,6 +24,7 @@ from canwall.bench.trial import Trial
 from canwall.config import Settings
 from canwall.drive import DriveError, DriveNode, Link, set_up
 from canwall.eds import load_eds
+from canwall.errors import first_of
 from canwall.run import on_the_bus
 
 
@@ -100,9 +101,8 @@ def examine(
         announce(f"putting the drive back as it was: {changes} values, {patience}")
         failures = [] if node is None else node.restore()
         if failures:
-            more = f", and {len(failures) - 1} more" if len(failures) > 1 else ""
             do = "switch the drive off and on: nothing was stored"
-            findings.add("put back", "not done", f"{failures[0]}{more}", well=False, do=do)
+            findings.add("put back", "not done", first_of(failures), well=False, do=do)
         else:
             findings.add("put back", "changes", "all undone; nothing was stored")
         errors.describe(findings)

@@ -12,8 +12,9 @@ from typing import NoReturn
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from canwall.cli import beginning, bench, export, identify, panel, run, study, sweep, workbench
-from canwall.cli.ending import INTERRUPTED, guarded
+from canwall.cli.ending import guarded
 from canwall.cli.program import add_version, make_program, run_program
+from canwall.stopping import INTERRUPTED
 
 __all__ = ["INTERRUPTED", "app", "guarded", "main", "make_program", "run_program"]
 

@@ -7,9 +7,10 @@ import typer
 
 from canwall.cli.output import console, say
 from canwall.errors import InputError, RunFailedError, did_you_mean, one_line
+from canwall.stopping import INTERRUPTED
 
-#: Exit codes: a run that failed or tripped, bad input, Ctrl-C with the drive disabled.
-FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+#: Exit codes beside INTERRUPTED: a run that failed or tripped, bad input.
+FAILED, BAD_INPUT = 1, 2
 
 
 class StoppedError(Exception):

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from canwall.cli.ending import FAILED, INTERRUPTED, failed_if
+from canwall.cli.ending import FAILED, failed_if
 from canwall.cli.options import (
     ConfigArgument,
     EdsOption,
@@ -19,7 +19,7 @@ from canwall.cli.options import (
 from canwall.cli.output import ProgressDisplay, console, print_json, say
 from canwall.errors import InputError
 from canwall.extras import how_to_install, is_installed
-from canwall.stopping import stop_on_signals
+from canwall.stopping import INTERRUPTED, stop_on_signals
 
 
 def identify(

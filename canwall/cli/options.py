@@ -70,13 +70,17 @@ def folder_path(text: str) -> Path:
 def refuse_to_overwrite(output: Path) -> None:
     """Raise InputError for a file that exists."""
     if output.is_file():
-        raise InputError(f"{output}: exists already; choose another --output")
+        raise _taken(output)
 
 
 def refuse_what_exists(output: Path) -> None:
     """Raise InputError for anything that exists, a folder as well."""
     if os.path.lexists(output):
-        raise InputError(f"{output}: exists already; choose another --output")
+        raise _taken(output)
+
+
+def _taken(output: Path) -> InputError:
+    return InputError(f"{output}: exists already; choose another --output")
 
 
 def absolute_path(path: Path | None) -> Path | None:

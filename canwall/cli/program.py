@@ -12,6 +12,7 @@ from typer.core import TyperGroup
 from canwall.cli.ending import StoppedError, guarded
 from canwall.cli.output import say
 from canwall.code_on_disk import is_first_start
+from canwall.stopping import end_at_once
 from canwall.supervised import given_up
 
 
@@ -94,9 +95,7 @@ def run_program(program: typer.Typer) -> NoReturn:
     gc.freeze()
     if any(map(threading.Thread.is_alive, given_up)):
         # A thread still computes with memory that Python would free.
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
+        end_at_once(code)
     sys.exit(code)
 
 

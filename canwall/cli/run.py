@@ -15,7 +15,7 @@ from rich import box
 from rich.table import Table
 
 from canwall.cli.completion import complete_config, complete_law
-from canwall.cli.ending import FAILED, INTERRUPTED, failed_if
+from canwall.cli.ending import FAILED, failed_if
 from canwall.cli.options import (
     ConfigArgument,
     EdsOption,
@@ -28,7 +28,7 @@ from canwall.cli.options import (
 from canwall.cli.output import ProgressDisplay, console, print_json, say
 from canwall.errors import ConfigError
 from canwall.extras import need
-from canwall.stopping import stop_on_signals
+from canwall.stopping import INTERRUPTED, stop_on_signals
 
 if TYPE_CHECKING:
     from canwall.config import Settings

@@ -10,11 +10,12 @@ import typer
 from rich.table import Table
 
 from canwall.cli.completion import complete_law
-from canwall.cli.ending import INTERRUPTED, failed_if
+from canwall.cli.ending import failed_if
 from canwall.cli.options import ConfigFile, JsonOption, folder_path, settings_from
 from canwall.cli.output import console, print_json
 from canwall.cli.program import make_program
 from canwall.extras import need
+from canwall.stopping import INTERRUPTED
 
 if TYPE_CHECKING:
     from canwall.study import Session, Terminal

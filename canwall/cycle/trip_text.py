@@ -5,6 +5,7 @@ from canwall.cycle.exchange import Exchange
 from canwall.cycle.state import RECENT_CYCLES
 from canwall.cycle.trips import Trip
 from canwall.drive import status_text
+from canwall.walls import failed_how
 
 #: Trips to which wrong or missing positions lead.
 _FROM_POSITIONS = (Trip.SPEED, Trip.POSITION, Trip.JUMP, Trip.STUCK, Trip.TORQUE, Trip.ENERGY)
@@ -93,8 +94,8 @@ def _failed_law(axis: WallAxis) -> str:
     present, before = (int(axis.cycle[wall]["law"][0, 0]) for wall in ("rendered", "faded"))
     for law in (axis.laws[i] for i in (present, before) if i >= 0):
         if failure := law.failure():
-            return f"law {law.name} raised {failure}"
-    return f"law {axis.laws[present].name} gave a force that is not a number"
+            return f"law {law.name} {failed_how(failure)}"
+    return f"law {axis.laws[present].name} {failed_how('')}"
 
 
 def _missing_recently(axis: WallAxis) -> str:

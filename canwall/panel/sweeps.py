@@ -166,9 +166,8 @@ class _Sweep:
         stored = {name: point[name].item() for name in found if name in point}
         columns = [motion.rows[name] for name in SIGNALS]
         columns += [motion.felt, motion.referent, motion.referent_felt]
-        with np.errstate(
-            over="ignore"
-        ):  # a law may ask for any force, and what is shown is then inf
+        # A law may ask for any force; what is shown is then infinite.
+        with np.errstate(over="ignore"):
             shown = np.array(columns, np.float32)
         pyramid = Pyramid(np.ascontiguousarray(motion.rows["t_s"]), shown)
         text = {

@@ -22,6 +22,7 @@ from canwall.cycle import (
 )
 from canwall.drive import REQUIRED_OBJECTS, DriveError, DriveNode, Link, set_up
 from canwall.eds import load_eds
+from canwall.errors import first_of
 from canwall.record import Ring
 from canwall.walls import Law
 
@@ -168,9 +169,8 @@ def _restored(node: DriveNode) -> list[str]:
     if not failures:
         return []
     name = f"node {node.node_id}: "
-    more = f", and {len(failures) - 1} more" if len(failures) > 1 else ""
-    first = failures[0].removeprefix(name)
-    return [f"{name}not restored: {first}{more}; switch the drive off and on"]
+    what = first_of(failures).removeprefix(name)
+    return [f"{name}not restored: {what}; switch the drive off and on"]
 
 
 def _tell(error: BaseException, not_restored: Sequence[str]) -> None:

@@ -27,6 +27,7 @@ from canwall.run.closed_loop import (
 )
 from canwall.run.referent import Referent
 from canwall.supervised import given_up
+from canwall.walls import failed_how
 
 Array = NDArray[np.float64]
 
@@ -359,9 +360,9 @@ class PreparedStrike:
         self._repeat(stiffness, damping)
         law = run_laws(self._settings)[0]
         failure = law.failure(self._loop.cycle["rendered"]["wall"].reshape(1))
-        what = f"raised {failure}" if failure else "gave a force that is not a number"
         raise RunFailedError(
-            f"{_shown(stiffness, damping)}: cycle {self.progress}: law {law.name} {what}"
+            f"{_shown(stiffness, damping)}: cycle {self.progress}: law {law.name} "
+            f"{failed_how(failure)}"
         )
 
     def motion(self, stiffness: float, damping: float) -> StrikeMotion:

@@ -105,6 +105,11 @@ class UnknownLawError(InputError):
     """A law that does not exist, does not compile, or does not have the given options."""
 
 
+def failed_how(failure: str) -> str:
+    """Say of a law how it failed: by what it raised (`Law.failure`), or if that is empty by NaN."""
+    return f"raised {failure}" if failure else "gave a force that is not a number"
+
+
 class Law:
     """A function of one WALL record that returns a force, and the options that it reads.
 

@@ -178,9 +178,10 @@ def _check_types(compiled: Any) -> None:
                 f"line {block.terminator.loc.line}: returns {_shown_type(kind)}; a law returns a "
                 f"number, on every way through it"
             )
-    for function in _with_callees(annotation):
+    functions = _with_callees(annotation)
+    for function in functions:
         _refuse_positions(function)
-    for function in _with_callees(annotation):
+    for function in functions:
         _refuse_changes(function)
 
 

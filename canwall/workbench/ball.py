@@ -21,6 +21,7 @@ from canwall.walls import (
     TENSION,
     WALL,
     Law,
+    failed_how,
     find_law,
     set_applied_force,
     set_plant,
@@ -139,8 +140,7 @@ def simulate_ball(
         j = int(lost.argmax())
         what = "the trajectory overflows"
         if found and math.isfinite(y[j]) and math.isnan(force[j]):
-            failure = found.failure()
-            what = f"raised {failure}" if failure else "gave a force that is not a number"
+            what = failed_how(found.failure())
         raise RunFailedError(f"{law}: {what} at t = {j * ball.period:g}")
     return trajectory
 
