@@ -14,6 +14,7 @@ from typing import Any, TypeAlias
 import can
 import numpy as np
 import pyarrow as pa
+import pytest
 from fork_server import COMMAND, ForkedPopen
 from numpy.typing import NDArray
 from rig import RPDO1, SIM_CONFIG, SYNC, TPDO1
@@ -63,6 +64,20 @@ def command(*arguments: object, cwd: Path | None = None) -> "subprocess.Complete
 def python(*arguments: object, cwd: Path | None = None) -> "subprocess.CompletedProcess[str]":
     """Run `python ARGUMENTS` in a forked process."""
     return _forked([sys.executable, *map(str, arguments)], cwd)
+
+
+def call(*arguments: object) -> Any:
+    """Call `canwall ARGUMENTS` in this process; return its exit code."""
+    from canwall import cli  # not in an emulated guest, where it takes seconds
+
+    words = sys.argv
+    try:
+        sys.argv = ["canwall", *map(str, arguments)]
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+    finally:
+        sys.argv = words
+    return ended.value.code
 
 
 def _forked(words: list[str], cwd: Path | None) -> "subprocess.CompletedProcess[str]":

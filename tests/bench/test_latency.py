@@ -3,7 +3,6 @@
 import csv
 import json
 import math
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 from colour_vision import assert_nothing_overlaps, assert_readable, assert_told_apart
-from commands import COMMAND, Start, command, config_file, wait_for
+from commands import COMMAND, Start, call, command, config_file, wait_for
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from rig import eds_with
 
 import canwall.bench
-from canwall import cli, config, simdrive
+from canwall import config, simdrive
 from canwall.bench import latency as latency_module
 from canwall.bench.budget import Budget, BudgetFrame, bus_budget
 from canwall.bench.latency import Histogram, Latency, LatencyPhase, measure_latency, shortest_cycle
@@ -429,10 +428,7 @@ def test_output_is_checked_before_the_measurement(
         (taken, "File exists; choose another folder"),
         (taken / "x", "Not a directory; choose another folder"),
     ):
-        monkeypatch.setattr(sys, "argv", ["canwall", "latency", "--output", str(folder)])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        assert ended.value.code == 2
+        assert call("latency", "--output", folder) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.endswith(f"{folder}: {said}")
     assert taken.read_text() == "mine"
@@ -449,10 +445,7 @@ def test_verdict_is_told_whatever_the_output_does(
         return measured()
 
     monkeypatch.setattr(canwall.bench, "measure_latency", lose_the_folder)
-    monkeypatch.setattr(sys, "argv", ["canwall", "latency", "--output", str(folder)])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    assert ended.value.code == 2
+    assert call("latency", "--output", folder) == 2
     out, errors = capsys.readouterr()
     assert out.splitlines()[-1] == measured().shortest_cycle.text
     assert errors == f"canwall: --output {folder}: File exists; choose another folder\n"

@@ -1,11 +1,10 @@
 """`scan`, `init` and `config`: from a simulated drive on a bus to its first configuration."""
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
-from commands import COMMAND, Start, command
+from commands import COMMAND, Start, call, command
 
 from canwall import cli, config
 from canwall.bench.soft_wall import soft_stiffness
@@ -111,15 +110,9 @@ def test_a_drive_by_its_name(
 
 def refused(capfd: pytest.CaptureFixture[str], *arguments: object) -> str:
     """The one line with which a command refuses its arguments."""
-    words = sys.argv
-    try:
-        sys.argv = ["canwall", *map(str, arguments)]
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-    finally:
-        sys.argv = words
+    code = call(*arguments)
     out, err = capfd.readouterr()
-    assert (ended.value.code, out) == (2, "")
+    assert (code, out) == (2, "")
     (line,) = err.splitlines()
     return line.removeprefix("canwall: ")
 

@@ -4,14 +4,13 @@ import contextlib
 import importlib
 import os
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import can
 import pytest
 from can.interfaces.virtual import VirtualBus
-from commands import COMMAND, command, config_file
+from commands import COMMAND, call, command, config_file
 from rig import eds_without
 
 from canwall import cli, config
@@ -47,21 +46,18 @@ class Said:
 
 
 @pytest.fixture
-def say(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> "Say":
-    return Say(capfd, monkeypatch)
+def say(capfd: pytest.CaptureFixture[str]) -> "Say":
+    return Say(capfd)
 
 
 class Say:
     """Runs a command in this process."""
 
-    def __init__(self, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-        self._capfd, self._monkeypatch = capfd, monkeypatch
+    def __init__(self, capfd: pytest.CaptureFixture[str]) -> None:
+        self._capfd = capfd
 
     def __call__(self, *arguments: object) -> Said:
-        self._monkeypatch.setattr(sys, "argv", ["canwall", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        return Said(ended.value.code, *self._capfd.readouterr())
+        return Said(call(*arguments), *self._capfd.readouterr())
 
 
 # Usage

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import typer
 import xarray as xr
-from commands import COMMAND, PATIENCE_S, Record, command, config_file
+from commands import COMMAND, PATIENCE_S, Record, call, command, config_file
 from rich.table import Table
 from typer.core import TyperGroup
 
@@ -42,12 +42,9 @@ class Run:
         self._capfd, self._patch = capfd, patch
 
     def __call__(self, *arguments: object) -> tuple[object, str, str]:
-        self._patch.setattr(sys, "argv", ["canwall", *map(str, arguments)])
         # The name of the program is not that of the one that runs the tests.
         self._patch.setattr(sys.modules["__main__"], "__package__", None, raising=False)
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        return (ended.value.code, *self._capfd.readouterr())
+        return (call(*arguments), *self._capfd.readouterr())
 
 
 # Help, version

@@ -1,7 +1,6 @@
 """The command, over the embedded bus: what it finds, writes and refuses, and how it ends."""
 
 import json
-import sys
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,10 +8,10 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from commands import command, config_file
+from commands import call, command, config_file
 from rig import eds_with, settings_with
 
-from canwall import cli, config
+from canwall import config
 from canwall.config import ConfigError, Settings
 from canwall.identify import UntellingDataError, identify
 from canwall.identify.excitation import Bounds, HandExcitation
@@ -94,15 +93,10 @@ def test_drive_that_is_not_restored_is_a_failure(tmp_path: Path) -> None:
     assert (tmp_path / "record/identify.json").exists()
 
 
-def test_report_that_is_there_is_kept(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_report_that_is_there_is_kept(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     """Nothing is enabled: there would be a record."""
     (tmp_path / "identify.toml").write_text("mine")
-    monkeypatch.setattr(sys, "argv", ["canwall", "identify", "--output", str(tmp_path)])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    assert ended.value.code == 2
+    assert call("identify", "--output", tmp_path) == 2
     said = f"canwall: {tmp_path}: holds identify.toml already; choose another --output\n"
     assert capsys.readouterr().err == said
     assert [path.name for path in tmp_path.iterdir()] == ["identify.toml"]

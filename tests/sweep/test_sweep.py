@@ -500,6 +500,18 @@ def test_a_worker_that_dies_is_one_line(tmp_path: Path) -> None:
     assert errors == f"canwall: {line}\n"
 
 
+def swept_once(
+    folder: Path, text: str, law: str, *stiffness: str
+) -> "subprocess.CompletedProcess[str]":
+    """Sweep a law of one's own with one strike on each wall."""
+    file = folder / "laws.py"
+    file.write_text(text)
+    return command(
+        *("sweep", settings_file(), "--output", folder / "a.nc", "--law", f"{file}:{law}"),
+        *("--axis", "speed=1", "--axis", "phase=0", *stiffness),
+    )
+
+
 RAISING = """def raising(wall):
     if wall.y < 0.0 and wall.stiffness > 50.0:
         raise ValueError("too stiff")
@@ -511,12 +523,7 @@ RAISING = """def raising(wall):
 @pytest.mark.parametrize("stiffness", [["--stiffness", "20,60,70"], []])
 def test_a_law_that_raises_is_named_with_its_wall(tmp_path: Path, stiffness: list[str]) -> None:
     """To raise is no limit of its stiffness."""
-    law = tmp_path / "laws.py"
-    law.write_text(RAISING)
-    done = command(
-        *("sweep", settings_file(), "--output", tmp_path / "a.nc", "--law", f"{law}:raising"),
-        *("--axis", "speed=1", "--axis", "phase=0", *stiffness),
-    )
+    done = swept_once(tmp_path, RAISING, "raising", *stiffness)
     assert done.returncode == 1
     assert re.fullmatch(
         r"canwall: .*stiffness [5-9]\d[\d.]*, damping 0: cycle \d+: law \S+laws.py:raising raised "
@@ -528,14 +535,8 @@ def test_a_law_that_raises_is_named_with_its_wall(tmp_path: Path, stiffness: lis
 @pytest.mark.slow
 @pytest.mark.parametrize("force", ["math.nan", "-math.inf"])
 def test_a_law_whose_force_is_no_number_is_named_with_its_wall(tmp_path: Path, force: str) -> None:
-    law = tmp_path / "laws.py"
-    law.write_text(
-        f"import math\n\ndef endless(wall):\n    return {force} if wall.y < 0.0 else 0.0\n"
-    )
-    done = command(
-        *("sweep", settings_file(), "--output", tmp_path / "a.nc", "--law", f"{law}:endless"),
-        *("--axis", "speed=1", "--axis", "phase=0", "--stiffness", "20"),
-    )
+    text = f"import math\n\ndef endless(wall):\n    return {force} if wall.y < 0.0 else 0.0\n"
+    done = swept_once(tmp_path, text, "endless", "--stiffness", "20")
     assert done.returncode == 1
     assert re.fullmatch(
         r"canwall: .*stiffness 20, damping 0: cycle \d+: law \S+laws.py:endless gave a force that "

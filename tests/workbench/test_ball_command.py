@@ -1,7 +1,6 @@
 """`canwall ball`: its file, its line, its errors."""
 
 import os
-import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bouncing import Array, integrated, sample_times, zoh_of
-from commands import command
+from commands import call, command
 
-from canwall import cli
 from canwall.walls import LAWS
 from canwall.workbench import Ball, sampled_ball
 
@@ -28,23 +26,14 @@ class Said:
 class Bounce:
     """Runs `canwall ball` in this process, into one file."""
 
-    def __init__(
-        self,
-        file: Path,
-        capfd: pytest.CaptureFixture[str],
-        monkeypatch: pytest.MonkeyPatch,
-    ) -> None:
-        self.file = file
-        self._capfd, self._monkeypatch = capfd, monkeypatch
+    def __init__(self, file: Path, capfd: pytest.CaptureFixture[str]) -> None:
+        self.file, self._capfd = file, capfd
 
     def __call__(self, *arguments: object) -> Said:
         if self.file.is_file():
             self.file.unlink()
-        words = ("canwall", "ball", "--output", self.file, *arguments)
-        self._monkeypatch.setattr(sys, "argv", [str(word) for word in words])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        return Said(ended.value.code, *self._capfd.readouterr())
+        code = call("ball", "--output", self.file, *arguments)
+        return Said(code, *self._capfd.readouterr())
 
     def columns(self) -> Array:
         """t, y, ẏ and f, shape (4, periods + 1)."""
@@ -57,7 +46,7 @@ def bounce(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> Bounce:
     monkeypatch.chdir(tmp_path)
-    return Bounce(tmp_path / "ball.csv", capfd, monkeypatch)
+    return Bounce(tmp_path / "ball.csv", capfd)
 
 
 def end_over_start(columns: Array) -> float:

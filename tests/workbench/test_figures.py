@@ -3,7 +3,6 @@
 import csv
 import math
 import re
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,13 +11,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from colour_vision import assert_nothing_overlaps, assert_readable, assert_told_apart
+from commands import call
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.signal import cont2discrete
 
-from canwall import cli
 from canwall.analysis import metrics
 from canwall.errors import InputError, RunFailedError
 from canwall.walls import LAWS
@@ -450,10 +449,7 @@ def test_command_is_a_call_of_it(
         return output / "index.md"
 
     monkeypatch.setattr(figures_module, "write_figures", fake)
-    monkeypatch.setattr(sys, "argv", ["canwall", "figures", "--output", str(tmp_path / "here")])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    assert ended.value.code == 0
+    assert call("figures", "--output", tmp_path / "here") == 0
     assert capsys.readouterr().out == f"{tmp_path / 'here' / 'index.md'}\n"
 
 
@@ -463,10 +459,7 @@ def test_folder_that_exists_is_kept(
     """Nothing is computed: a call of None would fail."""
     (tmp_path / "index.md").write_text("mine")
     monkeypatch.setattr(figures_module, "write_figures", None)
-    monkeypatch.setattr(sys, "argv", ["canwall", "figures", "--output", str(tmp_path)])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    assert ended.value.code == 2
+    assert call("figures", "--output", tmp_path) == 2
     said = f"canwall: {tmp_path}: exists already; choose another --output\n"
     assert capsys.readouterr().err == said
     assert (tmp_path / "index.md").read_text() == "mine"
