@@ -24,6 +24,7 @@ from canwall.cycle import (
     Grant,
     WallAxis,
     buckets_ns,
+    latest_emergency,
     percentile_ns,
     real_time_machine,
     run_laws,
@@ -36,6 +37,7 @@ from canwall.run import (
     drive_dictionary,
     make_axis,
     make_exchange,
+    make_monitor,
     on_the_bus,
     restoring_drives,
 )
@@ -175,7 +177,7 @@ def measure_latency(
         ConfigError: If the bus cannot be opened.
         DictionaryError: If the object dictionary cannot be used.
         DriveError: If the drive cannot be set up; if it was stopped, and cannot be put back.
-        RunFailedError: If no TPDO arrives.
+        RunFailedError: If no TPDO arrives, or somebody else acts on bus or drive.
         can.CanError: If the bus fails.
     """
     settings = measurement_settings(settings)
@@ -189,6 +191,7 @@ def measure_latency(
             axes.append(axis := make_axis(link, settings, dictionary, laws, ring))
             budget = cycle_budget(axis.node, axis.setup, settings.bus)
             with closing(make_exchange(link, [axis])) as exchange:
+                make_monitor(link, [axis])  # whose words are in `axis.suspected`
                 measurement = _Measurement(axis, exchange, stop, progress)
                 phases = []
                 for name, load in loads.items():
@@ -237,13 +240,14 @@ class _Measurement:
         self._period_s = axis.settings.bus.cycle_s
 
     def phase(self, name: str, duration_s: float) -> LatencyPhase:
-        """Measure for `duration_s` seconds. Raises RunFailedError if no TPDO arrives at all."""
+        """Measure for `duration_s` seconds. Raises RunFailedError as `measure_latency` does."""
         axis, exchange = self._axis, self._exchange
         self._run(name, _SETTLING_S, report=False)
         missed_before = int(axis.cycle["missed_tpdo"][0])
         if missed_before and missed_before == int(axis.cycle["j"][0]):
             raise RunFailedError(
                 f"no TPDO (0x{axis.setup.tpdo.cob_id:03X}) for {missed_before} SYNCs"
+                f"{latest_emergency(axis)}"
             )
         late_before = axis.late_rpdo
         histograms = (exchange.sync_error, axis.latency, axis.sync_to_rpdo)
@@ -268,6 +272,8 @@ class _Measurement:
                 self._progress(name, done * self._period_s, cycles * self._period_s)
             self._exchange.cycle(min(self._exchange.ahead, cycles - done))
             self._axis.ring.take_rows()
+            if self._axis.suspected:
+                raise RunFailedError(f"SYNC {int(cycle['j'][0])}: {self._axis.suspected}")
 
 
 @contextmanager

@@ -24,6 +24,7 @@ from canwall.cycle.state import (
 from canwall.cycle.step import step
 from canwall.cycle.timing import observe_ns
 from canwall.cycle.transport import CycleFrames, Transport
+from canwall.cycle.trip_text import latest_emergency
 from canwall.cycle.trips import Trip
 from canwall.cycle.way_out import Outcome, run_loop
 from canwall.realtime import Grant, real_time_priority
@@ -52,6 +53,7 @@ __all__ = [
     "WallStage",
     "buckets_ns",
     "fade_in",
+    "latest_emergency",
     "make_cycle",
     "modelled_delay",
     "named_law",

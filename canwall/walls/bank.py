@@ -104,6 +104,9 @@ BANK = np.dtype(
         ("far", "f8"),
         ("far_gain", "f8", (3, MAX_FILTERS)),
         ("far_share", "f8", (MAX_FILTERS,)),
+        # Square of the motion by a torque whose step of 1 N·m is not when it should be, up to the
+        # sample, over the variance of a reading.
+        ("untimely", "f8", (MAX_FILTERS,)),
         ("sampled", "f8"),
         ("equal", "i8"),  # samples in a row up to now
         # Over a period: Φ row by row, and the effects on (y, ẏ) of the older force, which acts up
@@ -215,7 +218,8 @@ def set_bank(
     set_regression(bank["regression"][0, 0], lightest, period, count, told, shaft)
     slower = 1 if shaft is None else OBSERVER_SLOWER_BEHIND_SHAFT
     set_probe(bank["probe"][0, 0], lightest, period, count, slower)
-    bank["stiffest"], bank["within"], bank["far_share"] = np.inf, 0.0, 0.0
+    bank["stiffest"] = np.inf
+    bank["within"] = bank["far_share"] = bank["untimely"] = 0.0
     bank["gain_in_flight"] = bank["trend_gain"] = 0.0
     bank["steadiest"] = STEADIEST * masses[-1] / period**2
     bank["viscous"][0, :n] = viscous
@@ -263,6 +267,7 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
     _note_flight(bank, estimator)
     slow = _SLOW * bank.regression[0].period + bank.regression[0].resolution
     follows = bank.presses and abs(y_sample - bank.sampled) <= slow
+    step = _torque_step(bank, estimator)
     for i in range(n):
         residual = y_sample - state[0, i]
         if bank.flies and bank.gain_in_flight[0, i] > 0.0:
@@ -271,8 +276,11 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
         far = residual - min(max(residual, -bank.far), bank.far)
         near = residual - far
         near -= min(max(near, -bank.within[i]), bank.within[i])
+        share = _untimely_share(bank, i, step)
         for c in range(3):
-            state[c, i] += gain[c, i] * near + bank.far_gain[c, i] * far
+            state[c, i] += (1.0 - share) * (gain[c, i] * near + bank.far_gain[c, i] * far)
+        state[0, i] += share * residual
+        state[1, i] += share * residual / bank.regression[0].period
         if follows:
             _follow_trend(bank, i, bank.trend_gain[i] * gain[2, i] * (near + far))
     _bound_velocity(bank, y_sample)
@@ -308,6 +316,27 @@ def _note_flight(bank: Record, estimator: Record) -> None:
     wall_acts = estimator.in_flight[now] != probe.in_flight[now]
     bank.pressed = bank.pressed + 1 if wall_acts else 0
     bank.presses = bank.landed <= bank.landing and bank.pressed >= _PRESSED
+
+
+@compiled
+def _torque_step(bank: Record, estimator: Record) -> float:
+    """Return the step of the wall's torque in the period up to this sample [N·m]."""
+    now, probes = estimator.delay_periods, bank.probe[0].in_flight
+    step = estimator.in_flight[now] - estimator.in_flight[now + 1]
+    return step - (probes[now] - probes[now + 1])
+
+
+@compiled
+def _untimely_share(bank: Record, i: int, step: float) -> float:
+    """Return the share of what filter i does not expect that a step of the torque has made.
+
+    The step may have come at another time than expected, and was an impulse more or less: noise
+    along (T, 1, 0) in [y, ẏ, d], of variance b² at the sample. It makes of the gain g of a filter
+    whose residual has the variance S the gain (1 − w)·g + w·(1, 1/T, 0), with w = b²/(b² + S). What
+    a blow does to position and velocity is thus not taken for a push.
+    """
+    ratio = bank.untimely[i] * step * step * (1.0 - bank.gain[0, i])
+    return ratio / (1.0 + ratio)
 
 
 @compiled

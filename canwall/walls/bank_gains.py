@@ -58,6 +58,10 @@ _WITHIN = 0.65
 #: hand whose steps of the encoder are felt much. A count is noise, and more is a handle that breaks
 #: loose or another push: a filter that follows both alike is felt, or has the handle hunt.
 _FAR, _FAR_SHARE = 1.5, 0.38
+#: Uncertainty of a torque's course, as a share of its steps, for filters of masses from the latter
+#: multiple of the lightest one on; none up to the former. The push of a light hand changes as fast
+#: as a wall does, and its filter needs all that a sample says of it.
+_UNTIMELY, _UNTIMELY_FROM = 0.04, (1.4, 2.2)
 #: Time constants of a filter for which samples have to be equal before its velocity is bounded by
 #: them. (Bounded by anything but the covariance that belongs to its gain, a filter of a handle at
 #: rest diverges.)
@@ -141,6 +145,8 @@ def set_filters(
             felt_more = max(1.0 - felt_less, 0.0)
             bank["within"][i] = 0.5 * _WITHIN * felt_more * count
             bank["far_share"][i] = _FAR_SHARE * felt_more
+            impulse = _untimely(heavier) * period / plant[0]
+            bank["untimely"][i] = 12.0 * (impulse * period / count) ** 2
         _set_filter(bank, i, kalman_model(*plant, count, walk))
         _set_paces(bank, i, plant, count, walk, lively / slower, rigid)
         _set_torques(bank, i, *plant)
@@ -151,6 +157,13 @@ def set_filters(
             in_flight = _IN_FLIGHT * lightest_bandwidth(bank["told"].item(), period)
             bank["gain_in_flight"][:, i] = gain = gain_with_trend(*plant, in_flight)
             bank["trend_gain"][i] = _IN_CONTACT * gain[3] / gain[2]
+
+
+def _untimely(heavier: float) -> float:
+    """Return the uncertainty of a torque's course by the mass over the lightest one."""
+    none, full = _UNTIMELY_FROM
+    share = math.log(heavier / none) / math.log(full / none)
+    return _UNTIMELY * min(max(share, 0.0), 1.0)
 
 
 def _set_paces(

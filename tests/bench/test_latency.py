@@ -57,6 +57,7 @@ class Listening:
         self.mute = False
         #: Lets nobody write the quick stop's option, from the first RPDO on.
         self.refusing = False
+        self.also: list[simdrive.Frame] = []  # sent once it is served, by whomever
         self._served = False
         drive.process = self._noted  # type: ignore[method-assign]
 
@@ -72,6 +73,8 @@ class Listening:
         ):
             return [(0x585, b"\x80" + data[1:4] + READ_ONLY)]
         frames = self._process(can_id, data)
+        if can_id == 0x080:
+            frames, self.also = [*frames, *self.also], []
         return [frame for frame in frames if not (self.mute and frame[0] == 0x185)]
 
 
@@ -117,6 +120,35 @@ def test_drive_that_does_not_answer_the_sync(drives: list[Listening]) -> None:
         drives[0].mute = True
 
     with pytest.raises(RunFailedError, match=r"no TPDO \(0x185\) for \d+ SYNCs"):
+        measure_latency(settings_of("python-can"), 0.1, 0, 0, StopRequest(), report=mute)
+
+
+@pytest.mark.parametrize(
+    ("frame", "said"),
+    [
+        ((0x080, b""), r"somebody else sends SYNC \(0x080\) as well: end it"),
+        ((0x205, bytes(4)), r"somebody else sends RPDOs \(0x205\) to the drive as well"),
+        ((0x000, b"\x02\x05"), r"somebody else has sent NMT STOP \(0x000\)"),
+        ((0x705, b"\x00"), "the drive restarted, or a second one with its node-ID started"),
+    ],
+)
+def test_what_disturbs_the_measurement_ends_it(
+    frame: simdrive.Frame, said: str, drives: list[Listening]
+) -> None:
+    def disturb(what: str, now_s: float, end_s: float) -> None:
+        if now_s > 0.05:
+            drives[0].also = [frame]
+
+    with pytest.raises(RunFailedError, match=rf"SYNC \d+: {said}"):
+        measure_latency(settings_of("python-can"), 0.2, 0, 0, StopRequest(), progress=disturb)
+
+
+def test_emergency_is_told_of_a_drive_that_sends_no_tpdo(drives: list[Listening]) -> None:
+    def mute(what: str) -> None:
+        drives[0].mute = True
+        drives[0].also = [(0x085, b"\x20\x32\x05" + bytes(5))]
+
+    with pytest.raises(RunFailedError, match=r"no TPDO \(0x185\) for \d+ SYNCs; EMCY 0x3220"):
         measure_latency(settings_of("python-can"), 0.1, 0, 0, StopRequest(), report=mute)
 
 

@@ -51,6 +51,23 @@ def test_cap_keeps_every_wall_quiet_in_a_light_hand(operator: str, delay_error: 
         assert _strikes(operator, friction, delay_error)["chatters"].sum() == 0
 
 
+def test_blow_on_a_stiff_wall_is_not_taken_for_a_push() -> None:
+    """A finger that comes fast, on walls without a cap: it would bounce on seven of these nine."""
+    axes = {"law": "mean_force", "model": "drive", "servo": "1600Hz", "operator": "finger"}
+    axes |= {"friction": 0.0, "delay_error": -0.3, "speed": 2.0, "press": 1.2}
+    settings = config.load(config.shipped("config/sim.toml"), {"wall.cap": 0.0})
+    phases, walls = [0.0, 0.35, 0.7], [0.856, 0.908, 0.962]
+    given = axes | {"phase": phases, "stiffness_normalised": walls}
+    plan = make_plan(settings.model_copy(update={"sweep": {}}), given)
+    (point,) = plan.points
+    found = [
+        plan.prepare(point, strike).on(stiffness * 2.28e-4 / 1e-6, 0.0)
+        for strike in plan.strikes
+        for stiffness in walls
+    ]
+    assert sum(each["chatters"] for each in found) == 0
+
+
 @pytest.mark.parametrize("delay_error", [-0.3, 0.0, 0.15])
 @pytest.mark.parametrize("operator", ["fingertip", "finger", "grip", "hand", "arm"])
 def test_known_hand_is_no_worse_than_an_unknown_one(operator: str, delay_error: float) -> None:

@@ -242,7 +242,7 @@ def gain_of(
 @pytest.mark.parametrize("i", [3, 8])
 def test_state_is_that_of_the_matching_filter_alone(i: int) -> None:
     bank, estimator = bank_at(0.0)
-    bank["within"], bank["far"] = 0.0, np.inf
+    bank["within"], bank["far"], bank["untimely"] = 0.0, np.inf, 0.0
     # With the delay as told, and what torques do then.
     bank["regression"]["excess_before"] = 1e18, 0.0
     phi_after, newer = discrete(MASSES[i], VISCOUS[i], 0.65 * PERIOD)
@@ -505,6 +505,34 @@ def test_what_is_far_from_the_prediction_is_followed_more_quickly(i: int) -> Non
         far = off - np.clip(off, -1.5, 1.5)
         corrected = own * near + (own + share * (quickest - own)) * far
         np.testing.assert_allclose(bank["state"][0, :, i], corrected * COUNT, rtol=1e-9)
+
+
+@pytest.mark.parametrize("step", [0.0, 0.05, -0.4])
+@pytest.mark.parametrize("i", [0, 2, 6, 15])
+def test_step_of_the_torque_may_be_untimely(i: int, step: float) -> None:
+    """A Kalman filter whose force model has noise in the impulse of 0.04 of the step."""
+    bank, estimator = bank_at(0.0)
+    bank["within"], bank["far"] = 0.0, np.inf
+    estimator["in_flight"][0, estimator["delay_periods"][0]] = step
+    scale = bank["scale"][0, i]
+    prior = bank["covariance"][0, i] * np.outer(scale, scale)
+    share = np.clip(np.log(MASSES[i] / MASSES[0] / 1.4) / np.log(2.2 / 1.4), 0.0, 1.0)
+    assert (share > 0.0) == (i > 1)
+    impulse = 0.04 * share * step * PERIOD / MASSES[i]
+    made = impulse * np.array([PERIOD, 1.0, 0.0])
+    prior += np.outer(made, made)
+    gain = prior[:, 0] / (prior[0, 0] + COUNT**2 / 12.0)
+    correct_bank(bank[0], estimator[0], 2.0 * COUNT)
+    np.testing.assert_allclose(bank["state"][0, :, i], 2.0 * COUNT * gain, rtol=1e-6)
+
+
+def test_step_of_a_probe_is_in_time() -> None:
+    """It is as small as what it shows, and its filter needs all of it."""
+    bank, estimator = bank_at(0.0)
+    now = estimator["delay_periods"][0]
+    estimator["in_flight"][0, now] = bank["probe"]["in_flight"][0, 0, now] = 0.02
+    correct_bank(bank[0], estimator[0], COUNT)
+    np.testing.assert_allclose(bank["state"][0, :, 4], COUNT * bank["gain"][0, :, 4], rtol=1e-9)
 
 
 def test_nothing_is_learned_in_free_motion_nor_at_rest() -> None:
