@@ -62,8 +62,17 @@ def folder_path(text: str) -> Path:
 
     Raises BadParameter.
     """
+    return _path(text, "a folder")
+
+
+def file_path(text: str) -> Path:
+    """Parse --output of a file. Raises BadParameter if it is empty."""
+    return _path(text, "a file")
+
+
+def _path(text: str, kind: str) -> Path:
     if not text:
-        raise typer.BadParameter("is empty; give a folder")
+        raise typer.BadParameter(f"is empty; give {kind}")
     return Path(text)
 
 

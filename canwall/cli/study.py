@@ -65,7 +65,7 @@ def staircase(
     from canwall.study import Staircase, run_staircases
 
     if start is None:
-        start = min(_SOFT, settings_from(config_file).wall.stiffness_nm_per_rad)
+        start = min(_SOFT, settings_from(config_file).wall.stiffness_nm_per_rad, ceiling)
     steps = Staircase(start, ceiling, finest)
     return _run_session(
         config_file, law, output, seconds, as_json, lambda session: run_staircases(session, steps)

@@ -1,5 +1,6 @@
 """Commands for sweeps: `sweep`, and `plot`, which draws recorded runs and sweeps."""
 
+import tempfile
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,6 +12,7 @@ from canwall.cli.options import (
     ConfigArgument,
     JsonOption,
     LawsOption,
+    file_path,
     refuse_what_exists,
     settings_from,
 )
@@ -25,7 +27,8 @@ if TYPE_CHECKING:
 def sweep(
     config_file: ConfigArgument = None,
     output: Annotated[
-        Path | None, typer.Option(metavar="FILE.nc", help="NetCDF file of the result.")
+        Path | None,
+        typer.Option(metavar="FILE.nc", parser=file_path, help="NetCDF file of the result."),
     ] = None,
     law: LawsOption = None,
     stiffness: Annotated[
@@ -103,9 +106,12 @@ def sweep(
         "rate": rate,
         "operator": operator,
     }
-    axes |= {name: values for name, values in options.items() if values is not None}
+    by_option = {name: values for name, values in options.items() if values is not None}
+    if twice := [name for name in by_option if name in axes]:
+        raise InputError(f"--{twice[0]} and --axis {twice[0]}: keep one of them")
+    axes |= by_option
     settings = settings_from(config_file)
-    from canwall.sweep import ineffective_axis_notes, make_plan, sweep_table
+    from canwall.sweep import how_to_go_on, ineffective_axis_notes, make_plan, sweep_table
     from canwall.sweep import sweep as run_sweep
 
     with ProgressDisplay() as display:
@@ -114,9 +120,9 @@ def sweep(
         try:
             dataset = run_sweep(plan, output, resume, workers, dask, progress)
         except KeyboardInterrupt:
-            raise StoppedError(f"interrupted; --resume continues {output}") from None
+            raise StoppedError(f"interrupted{how_to_go_on(output)}") from None
         except RunFailedError as error:
-            raise RunFailedError(f"{error}; --resume continues {output}") from None
+            raise RunFailedError(f"{error}{how_to_go_on(output)}") from None
     if as_json:
         print_json(dataset.to_dict())
         return 0
@@ -155,10 +161,12 @@ def _compute_law_table(
     dask: str | None,
 ) -> "Dataset":
     settings = settings_from(config_file)
-    from canwall.sweep import OPERATORS, compute_law_table, write_sweep
+    from canwall.sweep import OPERATORS, check_name, compute_law_table, write_sweep
 
     if output is not None:
+        check_name(output)
         refuse_what_exists(output)
+        _refuse_unwritable(output)
     with ProgressDisplay() as display:
         progress = partial(display.count, "striking walls")
         operators = operators or list(OPERATORS)
@@ -168,6 +176,15 @@ def _compute_law_table(
     if output is not None:
         write_sweep(dataset, output)
     return dataset
+
+
+def _refuse_unwritable(output: Path) -> None:
+    """Raise InputError unless a file can be made there: a table takes long."""
+    try:
+        with tempfile.TemporaryFile(dir=output.parent):
+            pass
+    except OSError as error:
+        raise InputError(f"{output}: cannot be written: {error.strerror}") from None
 
 
 def plot(

@@ -207,6 +207,7 @@ _TOML_TYPES = {
     "tuple_type": "an array",
     "too_long": "a pair",
     "is_instance_of": "a path in quotes",
+    "string_too_long": "a shorter text",
     "string_too_short": "a text that is not empty",
     "too_short": "an array that is not empty",
 }
@@ -263,4 +264,5 @@ def _suggestion(where: list[str], model: Any) -> str:
     known = [key for key in model.model_fields if key != "do"]  # names the request, not the wall
     if where[-1] in _METRIC_KEYS:
         return "; lengths and forces at the handle need mechanics.handle_radius_m"
-    return did_you_mean(where[-1], known) or f"; known here: {', '.join(known)}"
+    listed = f"; known here: {', '.join(known)}" if known else ""
+    return did_you_mean(where[-1], known) or listed

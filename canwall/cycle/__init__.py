@@ -4,7 +4,7 @@ from canwall.cycle.axis import Offer, WallAxis, WallStage
 from canwall.cycle.bus_monitor import BusMonitor
 from canwall.cycle.exchange import Exchange, SyncLostError
 from canwall.cycle.experiment import Experiment, ExperimentError
-from canwall.cycle.laws import named_law, run_laws, with_law
+from canwall.cycle.laws import law_of, named_law, run_laws, with_law
 from canwall.cycle.loop import Loop, WallGivenUpError
 from canwall.cycle.machine import real_time_machine
 from canwall.cycle.python_can import PythonCanTransport
@@ -54,6 +54,7 @@ __all__ = [
     "buckets_ns",
     "fade_in",
     "latest_emergency",
+    "law_of",
     "make_cycle",
     "modelled_delay",
     "named_law",

@@ -3,9 +3,19 @@
 from pathlib import Path
 from typing import Any
 
-from canwall.config import ConfigError, Settings, absolute_law
+from canwall.config import ConfigError, Settings, Wall, absolute_law
 from canwall.cycle.state import MAX_LAWS
 from canwall.walls import DEADBEAT, Law, UnknownLawError, find_law
+
+
+def law_of(wall: Wall) -> Law:
+    """Return the law of a wall. Raises ConfigError if there is none, or it lacks an option."""
+    try:
+        law = find_law(wall.law, wall.deadbeat)
+        law.option_values(wall.options)
+    except UnknownLawError as error:
+        raise ConfigError(f"wall.law: {error}") from None
+    return law
 
 
 def run_laws(settings: Settings) -> list[Law]:
@@ -17,11 +27,7 @@ def run_laws(settings: Settings) -> list[Law]:
     laws: dict[str, Law] = {}
     walls = [wall for stage in settings.stages for wall in settings.laws_in_turn(stage.wall)]
     for wall in walls:
-        try:
-            law = find_law(wall.law, wall.deadbeat)
-            law.option_values(wall.options)
-        except UnknownLawError as error:
-            raise ConfigError(f"wall.law: {error}") from None
+        law = law_of(wall)
         laws[law.name] = law
     for name in settings.run.more_laws:
         try:

@@ -79,7 +79,7 @@ def trip_text(axis: WallAxis, exchange: Exchange) -> str:
         case Trip.REPORTED:
             what = axis.reported
         case Trip.STOPPED:
-            what = "stopped from the panel"
+            what = "stopped by another process, the panel or a script"
         case _:
             what = _failed_law(axis)
     if trip in _FROM_POSITIONS:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from canwall.errors import ConfigError
 from canwall.extras import need
 from canwall.library.laws import LawLike, law_name
 from canwall.record.columns import ROW, UNITS, record_batch
@@ -118,6 +119,8 @@ class AttachedRun:
             "options": None if options is None else dict(options),
         }
         given = {key: value for key, value in given.items() if value is not None}
+        if "do" in keys:
+            raise ConfigError("do: unknown key; a change has keys of [[schedule]]")
         return self.live.request({"do": "change"} | given | keys)
 
     def take_turns(self, *walls: Mapping[str, Any]) -> int:

@@ -11,6 +11,7 @@ import pyarrow.csv as pa_csv
 from canwall.record import numbers
 from canwall.record.columns import COLUMNS, UNITS
 from canwall.record.folder import whole_file
+from canwall.record.summary import STRIKE_KEYS
 
 if TYPE_CHECKING:
     from canwall.library.recorded import RecordedRun
@@ -23,9 +24,12 @@ def write_csv(run: "RecordedRun") -> list[Path]:
         f"{name} [{unit}]" if unit else name
         for name, unit in zip(run.table.column_names, units, strict=True)
     ]
+    strikes = run.summary["strikes"]
     tables = {
         "signals.csv": run.table.rename_columns(heads),
-        "strikes.csv": pa.Table.from_pylist(run.summary["strikes"]),
+        "strikes.csv": pa.Table.from_pylist(strikes)
+        if strikes
+        else pa.table({name: pa.array([], pa.string()) for name in STRIKE_KEYS}),
     }
     for name, table in tables.items():
         with whole_file(run.folder / name) as file:

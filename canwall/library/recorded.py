@@ -10,6 +10,7 @@ from canwall.config import load as load_settings
 from canwall.extras import need
 from canwall.record import RunFolder
 from canwall.record.columns import UNITS
+from canwall.record.summary import STRIKE_KEYS
 from canwall.run import read_run
 
 if TYPE_CHECKING:
@@ -61,7 +62,8 @@ class RecordedRun:
         need("sweep")
         import pandas as pd
 
-        return pd.DataFrame(self.summary["strikes"])
+        strikes = self.summary["strikes"]
+        return pd.DataFrame(strikes, columns=None if strikes else list(STRIKE_KEYS))
 
     @cached_property
     def settings(self) -> Settings:

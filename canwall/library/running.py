@@ -9,7 +9,7 @@ from typing import Any
 
 import can
 
-from canwall.errors import RunFailedError, RunWarning, TrippedError
+from canwall.errors import InputError, RunFailedError, RunWarning, TrippedError
 from canwall.library.configuration import Config, wall_settings
 from canwall.library.laws import LawLike
 from canwall.library.progress import Progress
@@ -66,11 +66,13 @@ def run(
         raise RunFailedError(
             "run: call it from the main thread; in others no signal could end the wall"
         )
+    if output == "":
+        raise InputError("output: is empty, and would be the working directory; give a folder")
+    folder = None if output is None else Path(output)
     settings = wall_settings(config, overrides, law, stiffness, damping, duration, options)
     with stop_on_signals(held=False) as stop:
         try:
             with Progress(progress) as display:
-                folder = None if output is None else Path(output)
                 result = run_wall(settings, folder, display.report, display.advance)
         except can.CanError as error:
             raise RunFailedError(str(error)) from error

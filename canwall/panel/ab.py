@@ -1,10 +1,11 @@
 """A and B: two walls, one key to switch between them, or a turn for each from strike to strike."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from canwall.config import ConfigError, Wall
-from canwall.panel.walls import completed, parse_change
+from canwall.panel.walls import check_laws, completed, parse_change
+from canwall.record.live import LiveLaw
 
 #: Makes a request of the run and returns the cycle from which on it is in force.
 Request = Callable[[dict[str, Any]], int]
@@ -20,18 +21,20 @@ class AB:
         self._which: str | None = None
         self._auto = False
 
-    def set(self, a: object, b: object, wall: Wall) -> None:
+    def set(self, a: object, b: object, wall: Wall, laws: Sequence[LiveLaw]) -> None:
         """Choose the walls; none of them is in force by that.
 
         Args:
             a: Change that leads from `wall` to A, keys of `WallChange`.
             b: Change that leads to B.
             wall: The wall in force.
+            laws: The laws of the run.
 
         Raises:
-            ConfigError: For a change that is not valid.
+            ConfigError: For a change that is not valid, or one to a law that the run has not.
         """
         changes = [parse_change(one) for one in (a, b)]
+        check_laws(changes, wall, laws)
         *walls, _ = completed(changes, wall)
         self.auto(False)
         self._walls = dict(zip("ab", walls, strict=True))

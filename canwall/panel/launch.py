@@ -139,9 +139,14 @@ def _settings(settings: Settings, request: Start) -> Settings:
         wall, limits = request.changes.applied_to(settings.wall, settings.limits)
         raw |= {"wall": wall.model_dump(), "limits": limits.model_dump()}
     try:
-        return Settings.model_validate(raw)
+        asked = Settings.model_validate(raw)
     except ValidationError as error:
         raise ConfigError(first_error(error)) from None
+    if ":" not in asked.wall.law:  # a law in a file is the run's to load
+        from canwall.cycle import law_of
+
+        law_of(asked.wall)
+    return asked
 
 
 def _check_limits(change: WallChange, settings: Settings) -> None:

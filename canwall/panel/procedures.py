@@ -4,10 +4,10 @@ import json
 import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from canwall.config import ConfigError, Wall, WallChange
 from canwall.config.section import Array, Names, Number, Positive, Section
@@ -61,6 +61,12 @@ class ComparisonRequest(Section):
     repeats: int = Field(4, ge=1, le=100)
     switch: Literal["key", "strike"] = "key"
     seed: int | None = Field(None, ge=0)
+
+    @model_validator(mode="after")
+    def _of_one_kind(self) -> Self:
+        if self.walls and "factors" in self.model_fields_set:
+            raise ValueError("walls and factors are given; keep one of them")
+        return self
 
 
 class StaircaseRequest(Section):

@@ -101,7 +101,7 @@ class RunRequests:
     def _a_or_b(self, do: str, content: Any) -> dict[str, Any]:
         if do == "ab_set":
             a, b = (each.model_dump(exclude_none=True) for each in (content.a, content.b))
-            self._ab.set(a, b, self._wall)
+            self._ab.set(a, b, self._wall, self._live.settings().laws)
             return {}
         return _at(self._ab.use(content.which) if do == "ab_use" else self._ab.auto(content.on))
 

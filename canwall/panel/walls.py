@@ -1,11 +1,14 @@
 """Walls to be compared, each as a change that does not depend on the wall in force."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
-from canwall.config import ConfigError, Wall, WallChange, first_error
+from canwall.config import ConfigError, Wall, WallChange, absolute_law, first_error
+from canwall.record.live import LiveLaw
+from canwall.walls import DEADBEAT
 
 #: Keys that one change may give instead of another.
 _DAMPING = {"damping_nm_s_per_rad", "damping_ratio"}
@@ -19,6 +22,30 @@ def parse_change(given: object) -> WallChange:
         return WallChange.model_validate(given)
     except ValidationError as error:
         raise ConfigError(first_error(error, WallChange)) from None
+
+
+def check_laws(changes: Sequence[WallChange], wall: Wall, laws: Sequence[LiveLaw]) -> None:
+    """Raise ConfigError for a law that is none of the run's, or lacks an option.
+
+    Args:
+        changes: Changes of `wall`.
+        wall: The wall in force.
+        laws: The laws of the run.
+    """
+    options = {law.name: [option.name for option in law.options] for law in laws}
+    for change in changes:
+        name = wall.law + (DEADBEAT if wall.deadbeat else "")
+        if change.law is not None:
+            name = absolute_law(change.law, Path())
+        if name not in options:
+            raise ConfigError(
+                f"law {name} is not one of the run's: {', '.join(options)}; list it in "
+                "run.more_laws"
+            )
+        for option in change.options or {}:
+            if option not in options[name]:
+                known = f"it has {', '.join(options[name])}" if options[name] else "it has none"
+                raise ConfigError(f"law {name} has no option {option!r}; {known}")
 
 
 def completed(changes: Sequence[WallChange], wall: Wall) -> list[dict[str, Any]]:

@@ -166,6 +166,7 @@ class LiveRun:
         self._posting = threading.Lock()
         self._last_status: Status | None = None
         self._last_settings: tuple[int, LiveSettings] | None = None
+        self._closed = False
         self._mailbox = Mailbox.open(addresses.mailbox)
         self._controls = Controls.open(addresses.controls)
         self._ring = Ring.open(addresses.rows)
@@ -194,7 +195,10 @@ class LiveRun:
         self.close()
 
     def close(self) -> None:
-        """Close what is open; the run goes on."""
+        """Close what is open; the run goes on. Once is enough, and again does nothing."""
+        if self._closed:
+            return
+        self._closed = True
         self._mailbox.close()
         self._controls.close()
         self._ring.close()
@@ -246,9 +250,10 @@ class LiveRun:
             The cycle from which on it is in force.
 
         Raises:
-            ConfigError: If it is wrong, or the run refuses it; with the reason.
+            ConfigError: If it is wrong, the run refuses it, or this is closed; with the reason.
             RunFailedError: If the run has ended, or does not take it in time.
         """
+        self._refuse_closed()
         request = parse_request(values) if isinstance(values, dict) else values
         text = _with_absolute_laws(request).model_dump_json(exclude_none=True)
         try:
@@ -260,12 +265,24 @@ class LiveRun:
             raise RunFailedError(f"{self.folder.path}: the run {why}") from None
 
     def stop(self) -> None:
-        """Have the torque zero in the next RPDO, and the run end; no process has to wake up."""
+        """Have the torque zero in the next RPDO, and the run end; no process has to wake up.
+
+        Raises ConfigError if this is closed.
+        """
+        self._refuse_closed()
         self._controls.stop()
 
     def beat(self) -> None:
-        """Show a sign of life, for a run that was asked to watch for it (`watch_beat`)."""
+        """Show a sign of life, for a run that was asked to watch for it (`watch_beat`).
+
+        Raises ConfigError if this is closed.
+        """
+        self._refuse_closed()
         self._controls.beat()
+
+    def _refuse_closed(self) -> None:
+        if self._closed:
+            raise ConfigError(f"{self.folder.path}: is detached from; attach to it again")
 
 
 def _snapshots(memory: mmap.mmap) -> tuple[Snapshot, Snapshot]:

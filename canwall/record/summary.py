@@ -19,6 +19,32 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+#: Keys of a strike (docs/formats.md).
+STRIKE_KEYS = (
+    "start_s",
+    "end_s",
+    "law",
+    "stiffness",
+    "contacts",
+    "peak_penetration_rad",
+    "first_depth_rad",
+    "referent_first_depth_rad",
+    "restitution",
+    "peak_force_nm",
+    "energy_out_j",
+    "energy_out_max_j",
+    "chatter",
+    "chatter_reason",
+    "chatter_by",
+    "felt_ripple_n",
+    "chatter_amplitude_rad",
+    "chatter_frequency_hz",
+    "stiffness_in_force",
+    "stiffness_in_force_least",
+    "mass_est_kg_m2",
+    "mass_spread",
+    "delay_est_cycles",
+)
 #: Shortest contact whose ripple is judged without a referent to tell where it settles [s].
 _LONG_CONTACT_S = 0.2
 _SOURCE = ", estimated from the torque"

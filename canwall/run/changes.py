@@ -334,7 +334,9 @@ def _parse_change(assignments: Sequence[str]) -> Request:
     """Parse assignments. Raises ConfigError for an unknown key, or a value of a wrong type."""
     values: dict[str, Any] = {"do": "change"}
     for assignment in assignments:
-        key, _, value = assignment.partition("=")
+        key, equals, value = assignment.partition("=")
+        if not equals or not key.strip():
+            raise ConfigError(f"{assignment!r}: has to be KEY=VALUE")
         if key.strip() == "do":
             raise ConfigError("do: unknown key; `canwall change` changes the wall alone")
         table = values

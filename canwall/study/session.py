@@ -6,7 +6,9 @@ measured quantities.
 """
 
 import csv
-from collections.abc import Sequence
+import errno
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -79,6 +81,8 @@ class Session:
         self.troubles: list[str] = []
         self.table = folder / TABLE
         try:
+            if os.path.lexists(folder) and not folder.is_dir():
+                raise NotADirectoryError(errno.EEXIST, "it is a file")
             folder.mkdir(parents=True, exist_ok=True)
             with self.table.open("x", newline="", encoding="utf-8") as file:
                 csv.writer(file).writerow(field.name for field in fields(Verdict))
@@ -118,11 +122,15 @@ class Session:
             )
             self._terminal.ask("Hand off the handle. Enter begins, q ends:", ("",))
             result = self._run(settings, stiffness)
-            answers = self._ask_for_verdicts(result, laws)
-            if answers is None:
+            answers: dict[str, bool] = {}
+            try:
+                once_more = not self._ask_for_verdicts(result, laws, answers)
+            except (SessionEndedError, KeyboardInterrupt):
+                self._record_verdicts(result, stiffness, answers)
+                raise
+            if once_more:
                 continue
-            for law, free in answers.items():
-                self._record_verdict(result, law, stiffness, free)
+            self._record_verdicts(result, stiffness, answers)
             return answers
 
     def _settings(self, laws: Sequence[str], stiffness: float) -> Settings:
@@ -162,15 +170,16 @@ class Session:
             self._terminal.say(f"The run tripped: {trip}")
         return result
 
-    def _ask_for_verdicts(self, result: RunResult, laws: Sequence[str]) -> dict[str, bool] | None:
-        """Ask whether each law was free of chatter; None to render the wall again."""
+    def _ask_for_verdicts(
+        self, result: RunResult, laws: Sequence[str], answers: dict[str, bool]
+    ) -> bool:
+        """Ask if each law was free of chatter, into `answers`; False to render the wall again."""
         strikes = result.summary["strikes"]
         numbers = {law: _strike_numbers(strikes, law) for law in laws}
         struck = [law for law in laws if numbers[law]]
         if not struck or (len(struck) < len(laws) and not result.outcome.trips):
             self._terminal.say("Not every law had a strike (--seconds is how long): once more.")
-            return None
-        answers = {}
+            return False
         for law in struck:
             listed = ", ".join(map(str, numbers[law]))
             which = "The wall" if len(laws) == 1 else f"Strikes {listed}"
@@ -178,9 +187,15 @@ class Session:
                 f"{which}: free of chatter? y, n, again:", ("y", "n", "again")
             )
             if answer == "again":
-                return None
+                return False
             answers[law] = answer == "y"
-        return answers
+        return True
+
+    def _record_verdicts(
+        self, result: RunResult, stiffness: float, answers: Mapping[str, bool]
+    ) -> None:
+        for law, free in answers.items():
+            self._record_verdict(result, law, stiffness, free)
 
     def _record_verdict(self, result: RunResult, law: str, stiffness: float, free: bool) -> None:
         strikes = [strike for strike in result.summary["strikes"] if strike["law"] == law]

@@ -133,6 +133,12 @@ def assemble_dataset(plan: Plan, pieces: Mapping[int, NDArray[np.void]]) -> xr.D
     )
 
 
+def check_name(output: Path) -> None:
+    """Raise InputError for a name by which nobody would know the result as that of a sweep."""
+    if output.suffix != ".nc":
+        raise InputError(f"{output}: has to end in .nc, by which the result of a sweep is known")
+
+
 def write_sweep(dataset: xr.Dataset, output: Path) -> None:
     """Write the Dataset as NetCDF, completely or not at all. Raises InputError."""
     new = output.with_name(output.name + ".new")

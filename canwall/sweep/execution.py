@@ -5,7 +5,7 @@ from pathlib import Path
 
 import xarray as xr
 
-from canwall.sweep.dataset import assemble_dataset, plan_json, write_sweep
+from canwall.sweep.dataset import assemble_dataset, check_name, plan_json, write_sweep
 from canwall.sweep.journal import Journal
 from canwall.sweep.plan import Plan
 from canwall.sweep.workers import compute_pieces
@@ -36,6 +36,7 @@ def sweep(
         InputError: If the files or the scheduler cannot be used; nothing is computed then.
         RunFailedError: If the cluster fails, or a law does not return.
     """
+    check_name(output)
     journal = Journal(output, plan_json(plan), resume)
     try:
         done = set(journal.done())

@@ -78,6 +78,11 @@ def draw_sweep(dataset: xr.Dataset) -> Iterator[tuple[str, Figure]]:
             f"{dataset.attrs['title']}: a table has no figures; canwall sweep --table "
             f"{dataset.attrs['table']} prints it"
         )
+    if gone := [axis for axis in ("law", *STRIKES) if axis not in dataset.dims]:
+        raise InputError(
+            f"{', '.join(gone)}: no axis of this Dataset; figures are of whole sweeps: select with "
+            f"a list, {gone[0]}=[…]"
+        )
     kinds = _kinds(dataset)
     if not kinds:
         raise InputError("the sweep has a single stiffness: there is nothing to draw")

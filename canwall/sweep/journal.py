@@ -22,6 +22,16 @@ from canwall.errors import InputError
 _TITLE = b"canwall sweep journal"
 
 
+def how_to_go_on(output: Path) -> str:
+    """Return as a suffix how a sweep that was ended goes on; empty if it begins anew."""
+    return f"; --resume continues {output}" if journal_of(output).exists() else ""
+
+
+def journal_of(output: Path) -> Path:
+    """Return the path of the journal of a result."""
+    return output.with_name(output.name + ".partial")
+
+
 class Journal:
     """A file next to the result with the finished pieces of a plan, removed at the end.
 
@@ -42,7 +52,7 @@ class Journal:
         """
         if os.path.lexists(output):
             raise InputError(f"{output}: exists already; choose another --output")
-        self.path = output.with_name(output.name + ".partial")
+        self.path = journal_of(output)
         self._plan = hashlib.sha256(plan.encode()).digest()
         #: Place and length of the line of each finished piece.
         self._lines: dict[int, tuple[int, int]] = {}
@@ -66,16 +76,20 @@ class Journal:
         try:
             file = os.open(self.path, flags | os.O_CREAT | os.O_EXCL, 0o666)
         except FileExistsError:
-            if not resume:
-                raise InputError(
-                    f"{self.path}: holds an unfinished sweep; --resume continues it, or remove it"
-                ) from None
             try:
                 file = os.open(self.path, flags)
             except OSError as error:
                 if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
                     raise self._foreign() from None
                 raise
+            if not resume:
+                begin = os.pread(file, len(_TITLE), 0) if _is_regular(file) else None
+                os.close(file)
+                if begin is None or not _TITLE.startswith(begin):
+                    raise self._foreign() from None
+                raise InputError(
+                    f"{self.path}: holds an unfinished sweep; --resume continues it, or remove it"
+                ) from None
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -87,7 +101,7 @@ class Journal:
 
     def _read_lines(self) -> None:
         """Find the finished pieces, and cut off what follows the last whole line."""
-        if not stat.S_ISREG(os.fstat(self._file).st_mode):
+        if not _is_regular(self._file):
             raise self._foreign()
         title = b"%s %s\n" % (_TITLE, self._plan.hex().encode())
         found = os.pread(self._file, len(title), 0)
@@ -179,3 +193,7 @@ class Journal:
 
     def _unwritable(self, error: OSError) -> InputError:
         return InputError(f"{self.path}: cannot be written: {error.strerror}")
+
+
+def _is_regular(file: int) -> bool:
+    return stat.S_ISREG(os.fstat(file).st_mode)

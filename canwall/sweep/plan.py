@@ -34,8 +34,9 @@ _T = TypeVar("_T")
 
 #: Number of a piece of work, and its result as `compute_piece` returns it.
 PieceResult = tuple[int, NDArray[np.void]]
-#: Walls of a map in one piece of work, for which the strike is prepared once.
-_PIECE = 120
+#: Walls of a map in one piece of work, for which the strike is prepared once; by frames, which take
+#: some 300 times as long. What Ctrl-C keeps are whole pieces.
+_PIECE, _PIECE_BY_FRAMES = 120, 4
 #: Processor time in a single evaluation after which a law counts as one that does not return [s].
 _LAW_S = 0.5
 #: The largest result: 1.5 GB.
@@ -106,7 +107,11 @@ class Plan:
 
     @property
     def _per_strike(self) -> int:
-        return math.ceil(len(self.walls) / _PIECE)
+        return math.ceil(len(self.walls) / self._per_piece)
+
+    @property
+    def _per_piece(self) -> int:
+        return _PIECE_BY_FRAMES if self.through == "bus" else _PIECE
 
     @property
     def pieces(self) -> int:
@@ -122,7 +127,8 @@ class Plan:
             return condition, slice(0, len(self.strikes)), slice(damping, damping + 1)
         rest, part = divmod(piece, self._per_strike)
         condition, strike = divmod(rest, len(self.strikes))
-        walls = slice(part * _PIECE, min((part + 1) * _PIECE, len(self.walls)))
+        first = part * self._per_piece
+        walls = slice(first, min(first + self._per_piece, len(self.walls)))
         return condition, slice(strike, strike + 1), walls
 
     def settings(self, point: Mapping[str, Value], strike: Mapping[str, Value]) -> Settings:
@@ -278,18 +284,22 @@ def _supervised(
     thread that computes is left behind.
     """
     computed: list[_T] = []
-    call = Call(
-        lambda: computed.append(compute()),
-        lambda: [strike.progress for strike in prepared],
-    )
+    seen: list[tuple[int, str]] = []
+
+    def progress() -> list[tuple[int, str]]:
+        seen[:] = [(strike.progress, strike.evaluating) for strike in prepared]
+        return list(seen)
+
+    call = Call(lambda: computed.append(compute()), progress)
     while not call.has_ended():
         if is_abandoned():
             call.give_up()
             raise CancelledError
         if call.computed_s < _LAW_S:
             continue
-        for strike, at in zip(prepared, strikes, strict=True):
-            if evaluating := strike.evaluating:
+        # What was computed before an evaluation, as code that was compiled, is no law's.
+        for (_, evaluating), at in zip(seen, strikes, strict=True):
+            if evaluating:
                 call.give_up()
                 text = f"{evaluating} has not returned for {call.computed_s:.2g} s"
                 raise RunFailedError(_at({**point, **at}, text))

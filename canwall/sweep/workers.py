@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from canwall.errors import RunFailedError
+from canwall.errors import InputError, RunFailedError
 from canwall.sweep.cluster import compute_on_cluster
 from canwall.sweep.plan import PieceResult, Plan, compute_piece
 
@@ -35,19 +35,31 @@ def compute_pieces(
         dask: Address of a Dask scheduler, instead of this machine's cores.
 
     Raises:
-        InputError: If there is no scheduler at the address.
+        InputError: If there is no scheduler at the address, or nobody to work.
         RunFailedError: If the cluster fails, a process dies, or a law does not return.
     """
     if dask is not None:
         return compute_on_cluster(plan, pieces, dask)
+    if workers is not None and workers < 1:
+        raise InputError(f"workers = {workers}: has to be at least 1")
     count = workers or len(os.sched_getaffinity(0))
     if plan.through == "bus":
         # Frames are handled by the interpreter, so threads would share one lock.
         context = multiprocessing.get_context("spawn")
-        return _compute_in_pool(plan, pieces, ProcessPoolExecutor(count, context, _init_process))
+        pool = ProcessPoolExecutor(count, context, _init_process)
+        return _compute_in_pool(plan, pieces, pool, abandon=partial(_end_processes, pool))
     abandoned = threading.Event()
     compute = partial(compute_piece, is_abandoned=abandoned.is_set)
     return _compute_in_pool(plan, pieces, ThreadPoolExecutor(count), compute, abandoned.set)
+
+
+def _end_processes(pool: ProcessPoolExecutor) -> None:
+    """End the processes of a pool, whatever they compute.
+
+    ProcessPoolExecutor.terminate_workers does so from Python 3.14 on.
+    """
+    for process in list(pool._processes.values()):
+        process.terminate()
 
 
 def _init_process() -> None:

@@ -7,6 +7,7 @@ bias force, and its force acts at once: D = 0.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from types import MappingProxyType
 
@@ -78,6 +79,9 @@ class Ball:
     passivity: float = 0.0
 
     def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if name != "tension" and not isinstance(value, Real):
+                raise InputError(f"{name} has to be a number, not {value!r}")
         for name in ("mass", "period"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
                 raise InputError(f"{name} has to be a number above 0, not {getattr(self, name):g}")

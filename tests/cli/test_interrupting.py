@@ -29,18 +29,18 @@ _UNTIL_CALLED_S = 4.0
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("law", "begin", "end"),
+    ("law", "begin"),
     [
-        ("endless", ("ball",), ""),
-        ("slow", ("sweep", "--stiffness", "5:50:100", "--workers", "1"), "; --resume continues a"),
+        ("endless", ("ball",)),
+        ("slow", ("sweep", "--stiffness", "5:50:100", "--workers", "1")),
     ],
 )
 def test_ctrl_c_is_heard_while_a_law_computes(
-    tmp_path: Path, law: str, begin: tuple[str, ...], end: str
+    tmp_path: Path, law: str, begin: tuple[str, ...]
 ) -> None:
     (tmp_path / "laws.py").write_text(LAWS)
     process = ForkedPopen[str](
-        [COMMAND, *begin, "--law", f"laws.py:{law}", "--output", "a"],
+        [COMMAND, *begin, "--law", f"laws.py:{law}", "--output", "a.nc"],
         cwd=tmp_path,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -54,4 +54,4 @@ def test_ctrl_c_is_heard_while_a_law_computes(
             _, errors = process.communicate(timeout=PATIENCE_S)
         finally:
             process.kill()
-    assert (process.returncode, errors) == (130, f"canwall: interrupted{end}\n")
+    assert (process.returncode, errors) == (130, "canwall: interrupted\n")

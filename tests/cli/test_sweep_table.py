@@ -211,7 +211,9 @@ def test_a_table_has_no_figures(
         (["--law", "none"], "wall.law: unknown law 'none'"),
         (["--operator", "giant"], "sweep axis operator: has to be one of none, fingertip"),
         (["--through", "air"], "--through air: has to be sim or bus"),
-        (["--output", "there"], "there: exists already; choose another --output"),
+        (["--output", "there.nc"], "there.nc: exists already; choose another --output"),
+        (["--output", "new.txt"], "new.txt: has to end in .nc, by which the result of a sweep"),
+        (["--output", "no/new.nc"], "no/new.nc: cannot be written: No such file or directory"),
         (["--workers", "2", "--dask", "nowhere"], "--workers and --dask: keep one"),
         pytest.param(
             ["--dask", "nowhere"], "--dask nowhere: no scheduler there", marks=pytest.mark.slow
@@ -226,13 +228,13 @@ def test_options_without_a_meaning_for_the_table(
     line: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("there").touch()
+    Path("there.nc").touch()
     assert run("sweep", "--table", "laws", *arguments) == 2
     said = capsys.readouterr()
     assert said.out == ""
     assert len(said.err.splitlines()) == 1
     assert line in said.err
-    assert [path.name for path in tmp_path.iterdir()] == ["there"]
+    assert [path.name for path in tmp_path.iterdir()] == ["there.nc"]
 
 
 def test_unknown_table(capsys: pytest.CaptureFixture[str]) -> None:

@@ -47,6 +47,8 @@ def test_attached_run(start: Start, tmp_path: Path) -> None:
             run.change(stiffness=-1.0)
         with pytest.raises(ConfigError, match=r"limits\.torque_nm = 50"):
             run.change(limits={"torque_nm": 50.0})
+        with pytest.raises(ConfigError, match="do: unknown key"):
+            run.change(do="end")
         assert "12.5 N·m/rad; rendering, cycle" in repr(run)
         turns = run.take_turns({"stiffness_nm_per_rad": 3.0}, {"stiffness_nm_per_rad": 4.0})
         assert run.watch_beat(0) >= turns
@@ -54,6 +56,14 @@ def test_attached_run(start: Start, tmp_path: Path) -> None:
         assert process.wait(PATIENCE_S) == 128 + signal.SIGINT
         wait_for(lambda: run.status.ended)
         assert "ended" in repr(run)
+        run.close()
+    # Closed twice: no descriptor that somebody else has got since.
+    with (tmp_path / "mine").open("w") as mine:
+        run.close()
+        mine.write("mine")
+    for ask in (run.stop, run.end, run.live.beat):
+        with pytest.raises(ConfigError, match="is detached from; attach to it again"):
+            ask()
     recorded = canwall.read(run.folder)
     assert isinstance(recorded, canwall.RecordedRun)
     assert recorded.summary["guard"]["action"] == "act"

@@ -203,6 +203,21 @@ def test_interrupted_run_ends_as_the_command_does(tmp_path: Path, duration: floa
     assert not run.signals["torque_cmd"].iloc[-1]
 
 
+def test_run_without_a_strike_has_the_columns_of_strikes(
+    run: canwall.RecordedRun, tmp_path: Path
+) -> None:
+    empty = canwall.run(duration=0.05, output=tmp_path / "run", progress=False)
+    assert len(empty.strikes) == 0
+    assert list(empty.strikes) == list(run.strikes)
+    _, strikes = empty.to_csv()
+    assert pd.read_csv(strikes).columns.tolist() == list(run.strikes)
+
+
+def test_empty_output_is_not_the_working_directory() -> None:
+    with pytest.raises(InputError, match="output: is empty"):
+        canwall.run(output="")
+
+
 def test_run_is_refused_where_no_signal_would_end_it() -> None:
     refused: list[str] = []
 
@@ -373,6 +388,30 @@ def test_figures_of_a_sweep() -> None:
         canwall.sweep_figures(found.isel(stiffness=[0]))
 
 
+def test_figures_of_a_part_of_a_sweep() -> None:
+    found = canwall.sweep(
+        axes={"speed": [0.3, 0.8], "phase": 0.0},
+        law="standard",
+        stiffness="10:20:2",
+        progress=False,
+    )
+    with pytest.raises(InputError, match=r"speed: no axis of this Dataset.*speed=\[…\]"):
+        canwall.sweep_figures(found.isel(speed=0))
+    assert canwall.sweep_figures(found.isel(speed=[0]))
+
+
+def test_result_that_nobody_would_know_as_one(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"x\.txt: has to end in \.nc"):
+        canwall.sweep(law="standard", stiffness=10.0, output=tmp_path / "x.txt", progress=False)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("workers", [0, -1])
+def test_nobody_to_work(workers: int) -> None:
+    with pytest.raises(InputError, match=f"workers = {workers}: has to be at least 1"):
+        canwall.sweep(law="standard", stiffness=10.0, workers=workers, progress=False)
+
+
 def test_law_that_others_cannot_have_is_refused() -> None:
     canwall.law(spring)
     with pytest.raises(InputError, match="law spring: is declared in this process"):
@@ -387,6 +426,11 @@ def test_ball_falls_for_a_whole_number_of_periods() -> None:
     assert canwall.ball("continuous", periods=np.int64(3)).sizes == {"t": 4}
     with pytest.raises(InputError, match=r"whole number, 0 … 100000000, not 2\.5"):
         canwall.ball("continuous", periods=2.5)  # type: ignore[arg-type]
+
+
+def test_text_is_no_number_of_a_ball() -> None:
+    with pytest.raises(InputError, match="stiffness has to be a number, not '4'"):
+        canwall.ball("standard", stiffness="4")  # type: ignore[arg-type]
 
 
 def test_ball_falls_and_has_units() -> None:

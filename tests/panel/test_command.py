@@ -140,7 +140,10 @@ def test_run_outlives_its_panel_and_is_stopped_by_the_next(
             other_page.event("contact", law="midpoint")
             stopped = other_page.ask("stop")
             assert stopped["confirmed"]
-            assert "stopped from the panel" in other_page.event("run", state="ended")["text"]
+            assert (
+                "stopped by another process, the panel or a script"
+                in other_page.event("run", state="ended")["text"]
+            )
             again.send_signal(signal.SIGINT)
         panel.kill()
     panel.wait()

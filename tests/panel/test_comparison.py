@@ -15,6 +15,7 @@ from canwall.errors import InputError
 from canwall.panel.ab import AB
 from canwall.panel.comparison import Comparison
 from canwall.panel.walls import completed
+from canwall.record.live import LiveLaw
 from canwall.study import Staircase
 
 LIMITS = Limits(torque_nm=1.0)
@@ -258,6 +259,10 @@ def test_staircases_of_two_laws_are_those_of_the_study(tmp_path: Path) -> None:
             {"procedure": "comparison", "factors": []},
             "factors: has to be an array that is not empty",
         ),
+        (
+            {"procedure": "comparison", "factors": [2.0], "walls": [{"law": "standard"}]},
+            "walls and factors are given; keep one of them",
+        ),
         ({"procedure": "comparison", "repeats": 0}, "repeats: has to be"),
         ({"procedure": "comparison", "repeats": 100, "factors": [2.0] * 11}, "1100 trials"),
         ({"procedure": "staircase", "start": 600}, "start 600: has to be"),
@@ -296,7 +301,14 @@ def test_a_and_b() -> None:
     both = AB(run.request)
     with pytest.raises(ConfigError, match="set them first"):
         both.use("a")
-    both.set({"law": "standard"}, {"stiffness_nm_per_rad": 20.0}, run.wall)
+    laws = (LiveLaw(name="standard"), LiveLaw(name="mean_force"))
+    for wrong, said in (
+        ({"law": "damped"}, "law damped is not one of the run's: standard, mean_force; list it in"),
+        ({"options": {"zz": 1.0}}, "law mean_force has no option 'zz'; it has none"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            both.set({"law": "standard"}, wrong, run.wall, laws)
+    both.set({"law": "standard"}, {"stiffness_nm_per_rad": 20.0}, run.wall, laws)
     assert (both.use("b"), run.wall.law, run.wall.stiffness_nm_per_rad) == (100, "mean_force", 20.0)
     both.use("a")
     assert (run.wall.law, run.wall.stiffness_nm_per_rad) == ("standard", 50.0)
@@ -315,4 +327,4 @@ def test_a_and_b() -> None:
     with pytest.raises(ConfigError, match="has to be a or b"):
         both.use("c")
     with pytest.raises(ConfigError, match="has to be"):
-        both.set({"stiffness_nm_per_rad": -1.0}, {}, run.wall)
+        both.set({"stiffness_nm_per_rad": -1.0}, {}, run.wall, laws)

@@ -22,6 +22,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from canwall import config
 from canwall.analysis import metrics
+from canwall.config import ConfigError
 from canwall.cycle.state import MAX_LAWS
 from canwall.panel import follower, session
 from canwall.panel import server as panel_server
@@ -254,7 +255,8 @@ def test_requests_reach_the_run(page: PageOf, run: FakeRun) -> None:
         ('{"id": 1, "do": "take_turns", "walls": [1]}', "walls"),
         ('{"id": 1, "do": "start", "config": ""}', "config"),
         ('{"id": 1, "do": "start"}', "a run is in progress"),
-        ('{"id": 1, "do": "stop", "now": true}', "unknown key"),
+        ('{"id": 1, "do": "stop", "now": true}', "now: unknown key"),
+        ('{"id": 1, "do": "preset_use", "name": "%s"}' % ("x" * 201), "has to be a shorter text"),
         (r'{"id": 1, "do": "mark", "text": "\ud83d"}', "text: has half of a surrogate pair"),
     ],
 )
@@ -340,6 +342,22 @@ def test_two_starts_at_once_start_one_run(
         process.kill()
     assert str(refused) == "a run is in progress; end it first"
     assert len(runs) == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"law": "dampd"}, "unknown law 'dampd'; did you mean damped?"),
+        ({"options": {"zz": 1.0}}, "law mean_force has no option 'zz'"),
+    ],
+)
+def test_start_of_a_law_that_there_is_not(
+    tmp_path: Path, changes: dict[str, Any], said: str
+) -> None:
+    given = Start.model_validate({"changes": changes})
+    with pytest.raises(ConfigError, match=said):
+        Launcher(tmp_path).start(given)
+    assert not list(tmp_path.iterdir())
 
 
 def test_start_announces_no_more_laws_than_a_run_takes(

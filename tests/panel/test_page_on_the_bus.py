@@ -251,7 +251,7 @@ def test_page_changes_what_is_on_the_bus(
         page.page.wait_for_timeout(300)
         page.page.keyboard.press("Space")
         page.wait_for_text("stop-state", "stopped: zero torque, confirmed after")
-        page.wait_for_text("begin-text", "stopped from the panel")
+        page.wait_for_text("begin-text", "stopped by another process, the panel or a script")
         stopped = int(page.text("begin-text").split()[1])  # cycle …
         (folder,) = (tmp_path / "runs").iterdir()
         record = RunFolder(folder)

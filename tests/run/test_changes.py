@@ -255,6 +255,8 @@ class Bench:
     [
         (["position_rad=7"], "position_rad = 7 lies outside the run's limits.position_rad"),
         (["law=nothing"], "law: unknown law 'nothing'"),
+        (["cap"], "'cap': has to be KEY=VALUE"),
+        (["=80"], "'=80': has to be KEY=VALUE"),
         (["cap=0.1", "wall.cap=0.2"], "wall.cap: is given twice; keep one of them"),
         (["law=midpoint"], "law midpoint is not one of the run's: exponential, standard; list it"),
         (["law=mine.py:mine"], "is not one of the run's: exponential, standard; list it"),

@@ -137,7 +137,7 @@ def test_stop_word_ends_any_phase(attended: Callable[..., Attended], phase: Phas
     run = attended(measured)
     outcome = run.run({}, at=stopped_in(run, phase))
     (trip,) = outcome.trips
-    assert trip.endswith(": stopped from the panel")
+    assert trip.endswith(": stopped by another process, the panel or a script")
     assert outcome.disabled
     torques = run.torques()
     assert run.rows["phase"][outcome.trip_cycle] == phase

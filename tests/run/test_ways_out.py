@@ -229,7 +229,7 @@ def test_stop_word(start: Start, tmp_path: Path, exchange: str) -> None:
     # A witness that is slow loses frames, the master's own log has them all.
     rpdos = [rpdo(data) for _, data in Record(folder).cycles]
     (line,) = errors.splitlines()
-    assert line.endswith(": stopped from the panel")
+    assert line.endswith(": stopped by another process, the panel or a script")
     # The wall's last RPDO has no torque, before the loop had to be asked.
     leaving = next(k for k, (word, _) in enumerate(rpdos) if k and word < rpdos[k - 1][0])
     assert [torque != 0 for _, torque in rpdos[leaving - 2 : leaving]] == [True, False]

@@ -189,6 +189,28 @@ def test_laws_in_turn(folder: Path, people: list[Person]) -> None:
     ]
 
 
+def test_answers_before_the_end_of_a_session_are_kept(folder: Path, people: list[Person]) -> None:
+    laws = ("--law", "standard", "--law", "mean_force")
+    person = Person("alternating", folder, *laws, "--stiffness", "60,50", "--seconds", TWO)
+    people.append(person)
+    person.read_to(BEGINS)
+    person.type("")
+    person.read_to(STRUCK)
+    person.type("n")
+    person.read_to(STRUCK)
+    person.type("q")
+    code, said, errors = person.end()
+    assert (code, errors) == (0, "")
+    assert "1 verdicts" in said
+    assert [(v["law"], v["free_of_chatter"]) for v in person.verdicts] == [("standard", "False")]
+
+
+def test_a_file_is_no_folder_of_a_session(folder: Path) -> None:
+    folder.touch()
+    code, _, errors = Person("staircase", folder).end()
+    assert (code, errors) == (2, f"canwall: {folder}: cannot be written: it is a file\n")
+
+
 def test_a_law_that_is_given_twice_is_judged_once(folder: Path) -> None:
     laws = ["standard", "damped", "standard"]
     session = Session(load(SIM_CONFIG), laws, folder, ONE, Terminal())

@@ -4,6 +4,7 @@ import contextlib
 import os
 import signal
 import subprocess
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -229,6 +230,26 @@ def test_law_that_has_changed_since_a_worker_read_it_is_not_computed_with(
     assert f"a worker has another {law}, or has read it before it changed" in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert not list(tmp_path.glob("b.nc*"))
+
+
+def test_ctrl_c_ends_a_sweep_by_frames(tmp_path: Path) -> None:
+    """Within a piece, whose processes end with it; what is done is kept."""
+    output = tmp_path / "a.nc"
+    sweep = ("sweep", SIM_CONFIG, "--through", "bus", "--law", "standard")
+    process = subprocess.Popen(
+        [COMMAND, *map(str, sweep), "--stiffness", "1:100:400", "--output", str(output)],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    journal = tmp_path / "a.nc.partial"
+    wait_for(lambda: journal.exists() and len(journal.read_bytes().splitlines()) > 1)
+    began_s = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=PATIENCE_S)
+    assert time.monotonic() - began_s < 10.0
+    assert process.returncode == 130
+    assert errors.endswith(f"canwall: interrupted; --resume continues {output}\n")
+    assert journal.exists()
 
 
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])

@@ -396,8 +396,7 @@ def test_what_is_no_journal_is_left_alone(tmp_path: Path, kind: str, resume: boo
         partial.symlink_to(foreign)
     before = foreign.read_bytes() if foreign.exists() else b""
     own = partial.read_bytes() if kind == "database" else b""
-    message = "holds no unfinished sweep; remove it" if resume else "holds an unfinished sweep"
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match="holds no unfinished sweep; remove it"):
         Journal(tmp_path / "a.nc", "plan", resume)
     assert (foreign.read_bytes() if foreign.exists() else b"") == before
     assert (partial.read_bytes() if kind == "database" else b"") == own
@@ -496,8 +495,8 @@ def test_a_worker_that_dies_is_one_line(tmp_path: Path) -> None:
         finally:
             sweeping.kill()
     assert sweeping.returncode == 1
-    line = f"a process that computes the sweep has died; --resume continues {tmp_path}/a.nc"
-    assert errors == f"canwall: {line}\n"
+    hint = rf"(; --resume continues {tmp_path}/a\.nc)?"  # if a piece was done
+    assert re.fullmatch(rf"canwall: a process that computes the sweep has died{hint}\n", errors)
 
 
 def swept_once(
@@ -527,7 +526,7 @@ def test_a_law_that_raises_is_named_with_its_wall(tmp_path: Path, stiffness: lis
     assert done.returncode == 1
     assert re.fullmatch(
         r"canwall: .*stiffness [5-9]\d[\d.]*, damping 0: cycle \d+: law \S+laws.py:raising raised "
-        r"ValueError: too stiff \(laws.py, line 3\); --resume continues \S+\n",
+        r"ValueError: too stiff \(laws.py, line 3\)\n",
         done.stderr,
     )
 
@@ -540,7 +539,7 @@ def test_a_law_whose_force_is_no_number_is_named_with_its_wall(tmp_path: Path, f
     assert done.returncode == 1
     assert re.fullmatch(
         r"canwall: .*stiffness 20, damping 0: cycle \d+: law \S+laws.py:endless gave a force that "
-        r"is not a number; --resume continues \S+\n",
+        r"is not a number\n",
         done.stderr,
     )
 
@@ -623,7 +622,9 @@ def test_a_wrong_axis(axes: dict[str, str], message: str) -> None:
         (["--axis", "speed"], "--axis speed: has to be NAME=VALUES"),
         (["--through", "air"], "--through air: has to be sim or bus"),
         (["--workers", "2", "--dask", "nowhere"], "--workers and --dask: keep one"),
-        (["--output", "."], ".: exists already"),
+        (["--output", "."], ".: has to end in .nc"),
+        (["--output", ""], "Invalid value for '--output': is empty; give a file"),
+        (["--stiffness", "10", "--axis", "stiffness=20"], "--stiffness and --axis stiffness: keep"),
         (["--output", "/none/a.nc"], "/none/a.nc.partial: cannot be written"),
         (["--dask", "tcp://127.0.0.1:9"], "--dask tcp://127.0.0.1:9: no scheduler there"),
         (["--dask", "nowhere"], "--dask nowhere: no scheduler there"),

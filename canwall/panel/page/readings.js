@@ -110,6 +110,15 @@ function details(event) {
     .join(", ");
 }
 
+/** The text of a mark; a blind comparison notes its trials as JSON. */
+function ofMark(text) {
+  if (!text.startsWith('{"blind":')) return text;
+  const { blind, trial, answer, reason } = JSON.parse(text);
+  if (reason !== undefined) return `blind comparison: ${reason}`;
+  if (trial === undefined) return `blind ${blind} begins`;
+  return answer === undefined ? `trial ${trial}` : `trial ${trial}: answered`;
+}
+
 /** The latest marks, newest first. */
 export function showMarks(marks) {
   const shown = marks.slice(-6).reverse().map((event) => {
@@ -117,7 +126,7 @@ export function showMarks(marks) {
     const time = document.createElement("span");
     time.className = "muted";
     time.textContent = `${fixed(event.t_s, 1)} s`;
-    const what = event.what === "mark" ? event.text : event.what === "change" ? "" : event.what.replaceAll("_", " ");
+    const what = event.what === "mark" ? ofMark(event.text) : event.what === "change" ? "" : event.what.replaceAll("_", " ");
     const words = document.createElement("span");
     words.textContent = [what, details(event)].filter(Boolean).join(": ");
     item.append(time, words);
