@@ -14,6 +14,7 @@ import math
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,8 @@ _BLOCKS, _T_95 = 8, 2.365
 #: Largest half of the interval, and difference of two measurements beyond their intervals
 #: [periods].
 _UNCERTAIN, _DIFFERENCE = 0.1, 0.02
+#: Share of what a fit leaves unexplained below which the same from there on shows that it stopped.
+_STOPPED = 0.1
 #: Initial values of the delay in the fit [periods].
 _GUESSES = np.arange(0.0, MAX_DELAY + 0.1, 0.5)
 #: Travel of the handle under a pair of torques [rad]: many counts, yet hardly felt by a hand.
@@ -204,12 +207,18 @@ def measured_delay(position: Array, torque: Array, period: float, mechanics: Mec
         guess = min(guesses, key=lambda parameters: float(np.sum(misses(parameters) ** 2)))
         low = np.array([1e-3, 0.0, 0.0, 0.0, -1.0, 0.0])
         high = np.array([1e3, 1e3, 1e3, 1.0, 1.0, float(MAX_DELAY)])
-        inside = [np.clip(guess, low + 1e-6, high - 1e-6)]
+
+        def fitted(x: Array, friction: Array | float) -> Any:
+            x = np.clip(np.where(np.arange(6) == 3, friction, x), low + 1e-6, high - 1e-6)
+            return least_squares(misses, x, bounds=(low, high), x_scale=0.1)
+
         # A handle that sticks makes minima of its own: from some friction, and from none.
-        inside.append(np.where(np.arange(6) == 3, 1e-6, inside[0]))
-        fits = [least_squares(misses, x, bounds=(low, high), x_scale=0.1) for x in inside]
-        fit = min(fits, key=lambda fit: float(fit.cost))
+        fit = min(fitted(guess, guess), fitted(guess, 0.0), key=_cost)
         if _rms(fit.fun) ** 2 < 1.0 - _EXPLAINED:
+            # It may have stopped where sticking begins. Of a disturbed motion nothing tells more.
+            further = fitted(fit.x, 0.0)
+            if further.cost < _STOPPED * fit.cost:
+                fit = further
             delay = Delay(float(fit.x[-1]), _half_interval(np.asarray(fit.jac), fit.fun))
             if delay.half <= _UNCERTAIN:
                 return delay
@@ -222,6 +231,10 @@ def measured_delay(position: Array, torque: Array, period: float, mechanics: Mec
         "the delay cannot be measured: the handle does not follow small torques; let it go, "
         "give more estimator.measure_torque_nm, or set estimator.delay_cycles"
     )
+
+
+def _cost(fit: Any) -> float:
+    return float(fit.cost)
 
 
 def _half_interval(slopes: Array, left: Array) -> float:
