@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 #: Interval at which a call is looked at [s].
 LOOK_S = 0.01
@@ -36,6 +37,7 @@ class Call:
 
     Attributes:
         error: What the function raised, once it has ended.
+        seen: Progress at the last look.
         waited_s: Time without progress in which the thread waited, not for a processor [s].
         computed_s: Time without progress in which it computed [s].
     """
@@ -52,7 +54,8 @@ class Call:
         self._function, self._progress = function, progress
         self._ended = threading.Event()
         self._clock: int | None = None
-        self._seen, self._looked_s, self._passed_s = progress(), time.monotonic(), 0.0
+        self.seen: Any = progress()
+        self._looked_s, self._passed_s = time.monotonic(), 0.0
         self._begun = (0.0, 0.0)
         self._thread = threading.Thread(target=self._run, daemon=True)
         try:
@@ -93,8 +96,8 @@ class Call:
         # If this thread did not run either, the machine stood still, and not the call.
         self._passed_s += min(now_s - self._looked_s, 2.0 * LOOK_S)
         self._looked_s = now_s
-        if progress != self._seen:
-            self._seen, self._passed_s, self._begun = progress, 0.0, self._spent()
+        if progress != self.seen:
+            self.seen, self._passed_s, self._begun = progress, 0.0, self._spent()
             self.waited_s = self.computed_s = 0.0
             return
         computed_s, queued_s = (

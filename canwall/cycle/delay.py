@@ -208,12 +208,12 @@ def measured_delay(position: Array, torque: Array, period: float, mechanics: Mec
         low = np.array([1e-3, 0.0, 0.0, 0.0, -1.0, 0.0])
         high = np.array([1e3, 1e3, 1e3, 1.0, 1.0, float(MAX_DELAY)])
 
-        def fitted(x: Array, friction: Array | float) -> Any:
+        def fitted(x: Array, friction: float) -> Any:
             x = np.clip(np.where(np.arange(6) == 3, friction, x), low + 1e-6, high - 1e-6)
             return least_squares(misses, x, bounds=(low, high), x_scale=0.1)
 
         # A handle that sticks makes minima of its own: from some friction, and from none.
-        fit = min(fitted(guess, guess), fitted(guess, 0.0), key=_cost)
+        fit = min(fitted(guess, guess[3]), fitted(guess, 0.0), key=lambda fit: float(fit.cost))
         if _rms(fit.fun) ** 2 < 1.0 - _EXPLAINED:
             # It may have stopped where sticking begins. Of a disturbed motion nothing tells more.
             further = fitted(fit.x, 0.0)
@@ -231,10 +231,6 @@ def measured_delay(position: Array, torque: Array, period: float, mechanics: Mec
         "the delay cannot be measured: the handle does not follow small torques; let it go, "
         "give more estimator.measure_torque_nm, or set estimator.delay_cycles"
     )
-
-
-def _cost(fit: Any) -> float:
-    return float(fit.cost)
 
 
 def _half_interval(slopes: Array, left: Array) -> float:

@@ -8,7 +8,8 @@ from pydantic import ValidationError
 
 from canwall.config import ConfigError, Wall, WallChange, absolute_law, first_error
 from canwall.record.live import LiveLaw
-from canwall.walls import DEADBEAT
+from canwall.run.changes import not_of_the_run
+from canwall.walls import DEADBEAT, UnknownLawError, refuse_other_options
 
 #: Keys that one change may give instead of another.
 _DAMPING = {"damping_nm_s_per_rad", "damping_ratio"}
@@ -38,14 +39,11 @@ def check_laws(changes: Sequence[WallChange], wall: Wall, laws: Sequence[LiveLaw
         if change.law is not None:
             name = absolute_law(change.law, Path())
         if name not in options:
-            raise ConfigError(
-                f"law {name} is not one of the run's: {', '.join(options)}; list it in "
-                "run.more_laws"
-            )
-        for option in change.options or {}:
-            if option not in options[name]:
-                known = f"it has {', '.join(options[name])}" if options[name] else "it has none"
-                raise ConfigError(f"law {name} has no option {option!r}; {known}")
+            raise not_of_the_run(name, options)
+        try:
+            refuse_other_options(name, options[name], change.options or {})
+        except UnknownLawError as error:
+            raise ConfigError(str(error)) from None
 
 
 def completed(changes: Sequence[WallChange], wall: Wall) -> list[dict[str, Any]]:

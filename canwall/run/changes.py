@@ -10,7 +10,7 @@ import json
 import threading
 import time
 import tomllib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from typing import Any, assert_never
 
@@ -307,9 +307,14 @@ def _check_law(axis: WallAxis, wall: Wall) -> None:
     except UnknownLawError as error:
         raise ConfigError(f"law: {error}") from None
     if name not in known:
-        raise ConfigError(
-            f"law {name} is not one of the run's: {', '.join(known)}; list it in run.more_laws"
-        )
+        raise not_of_the_run(name, known)
+
+
+def not_of_the_run(name: str, known: Iterable[str]) -> ConfigError:
+    """Return the error for a law that is none of those that the run may change to."""
+    return ConfigError(
+        f"law {name} is not one of the run's: {', '.join(known)}; list it in run.more_laws"
+    )
 
 
 def post_change(folder: RunFolder, assignments: Sequence[str]) -> int:

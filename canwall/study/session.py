@@ -8,7 +8,7 @@ measured quantities.
 import csv
 import errno
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -123,15 +123,16 @@ class Session:
             self._terminal.ask("Hand off the handle. Enter begins, q ends:", ("",))
             result = self._run(settings, stiffness)
             answers: dict[str, bool] = {}
+            once_more = False
             try:
                 once_more = not self._ask_for_verdicts(result, laws, answers)
-            except (SessionEndedError, KeyboardInterrupt):
-                self._record_verdicts(result, stiffness, answers)
-                raise
-            if once_more:
-                continue
-            self._record_verdicts(result, stiffness, answers)
-            return answers
+            finally:
+                # Whoever ends the session meanwhile has given the answers before that.
+                if not once_more:
+                    for law, free in answers.items():
+                        self._record_verdict(result, law, stiffness, free)
+            if not once_more:
+                return answers
 
     def _settings(self, laws: Sequence[str], stiffness: float) -> Settings:
         settings = with_law(self._base, laws[0])
@@ -190,12 +191,6 @@ class Session:
                 return False
             answers[law] = answer == "y"
         return True
-
-    def _record_verdicts(
-        self, result: RunResult, stiffness: float, answers: Mapping[str, bool]
-    ) -> None:
-        for law, free in answers.items():
-            self._record_verdict(result, law, stiffness, free)
 
     def _record_verdict(self, result: RunResult, law: str, stiffness: float, free: bool) -> None:
         strikes = [strike for strike in result.summary["strikes"] if strike["law"] == law]

@@ -284,13 +284,10 @@ def _supervised(
     thread that computes is left behind.
     """
     computed: list[_T] = []
-    seen: list[tuple[int, str]] = []
-
-    def progress() -> list[tuple[int, str]]:
-        seen[:] = [(strike.progress, strike.evaluating) for strike in prepared]
-        return list(seen)
-
-    call = Call(lambda: computed.append(compute()), progress)
+    call = Call(
+        lambda: computed.append(compute()),
+        lambda: [(strike.progress, strike.evaluating) for strike in prepared],
+    )
     while not call.has_ended():
         if is_abandoned():
             call.give_up()
@@ -298,7 +295,7 @@ def _supervised(
         if call.computed_s < _LAW_S:
             continue
         # What was computed before an evaluation, as code that was compiled, is no law's.
-        for (_, evaluating), at in zip(seen, strikes, strict=True):
+        for (_, evaluating), at in zip(call.seen, strikes, strict=True):
             if evaluating:
                 call.give_up()
                 text = f"{evaluating} has not returned for {call.computed_s:.2g} s"

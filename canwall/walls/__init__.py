@@ -53,6 +53,7 @@ from canwall.walls.interface import (
     failed_how,
     law,
     put_in_force,
+    refuse_other_options,
     set_plant,
     set_referent,
 )
@@ -108,6 +109,7 @@ __all__ = [
     "predict_bank",
     "predict_open_loop",
     "put_in_force",
+    "refuse_other_options",
     "reset_bank",
     "reset_estimator",
     "reset_latch",

@@ -5,7 +5,7 @@ the record and returns f; it does not clamp to the drive's limits and does not r
 """
 
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -169,12 +169,17 @@ class Law:
 
         Raises UnknownLawError for a name that is no option of this law.
         """
-        for name in given:
-            if name not in self.options:
-                known = ", ".join(self.options) or "none"
-                hint = did_you_mean(name, self.options) or f"; it has {known}"
-                raise UnknownLawError(f"law {self.name} has no option {name!r}{hint}")
+        refuse_other_options(self.name, self.options, given)
         return [given.get(name, default) for name, default in self.options.items()]
+
+
+def refuse_other_options(law: str, options: Collection[str], given: Iterable[str]) -> None:
+    """Raise UnknownLawError for a name given that is none of a law's options."""
+    for name in given:
+        if name not in options:
+            known = ", ".join(options) or "none"
+            hint = did_you_mean(name, options) or f"; it has {known}"
+            raise UnknownLawError(f"law {law} has no option {name!r}{hint}")
 
 
 #: Added to a law's name for its variant with deadbeat compensation.

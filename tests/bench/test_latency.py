@@ -57,7 +57,7 @@ class Listening:
         self.mute = False
         #: Lets nobody write the quick stop's option, from the first RPDO on.
         self.refusing = False
-        self.also: list[simdrive.Frame] = []  # sent once it is served, by whomever
+        self.also: list[simdrive.Frame] = []  # sent after the next SYNC, by whomever
         self._served = False
         drive.process = self._noted  # type: ignore[method-assign]
 
