@@ -6,6 +6,7 @@ the function reads them by name: `wall.options.growth`.
 """
 
 import dis
+import importlib.machinery
 import importlib.util
 import inspect
 import keyword
@@ -16,7 +17,7 @@ import sys
 import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import FunctionType
+from types import CodeType, FunctionType
 from typing import Any
 
 import numpy as np
@@ -31,12 +32,23 @@ from canwall.errors import did_you_mean
 from canwall.walls.interface import MAX_OPTIONS, WALL, Law, UnknownLawError, wall_with
 
 
+class _Source(importlib.machinery.SourceFileLoader):
+    """Loader of a file as it is now.
+
+    Bytecode that Python kept beside it may be that of a file that was changed within a second.
+    """
+
+    def get_code(self, fullname: str) -> CodeType:
+        return self.source_to_code(self.get_data(self.path), self.path)
+
+
 def load_law(path: Path, function: str) -> Law:
     """Return the law of a function in a file, compiled. Raises UnknownLawError."""
     where = f"{path}:{function}"
     if not os.path.isfile(path):  # Path.is_file raises for names that are too long
         raise UnknownLawError(f"{where}: no such file")
-    spec = importlib.util.spec_from_file_location(path.stem, path)
+    loader = _Source(path.stem, str(path)) if path.suffix == ".py" else None
+    spec = importlib.util.spec_from_file_location(path.stem, path, loader=loader)
     if spec is None or spec.loader is None:
         raise UnknownLawError(f"{where}: not a Python file")
     module = importlib.util.module_from_spec(spec)

@@ -1,7 +1,9 @@
 """A law in the user's own file: the documentation's example, and errors in such files."""
 
+import os
 import runpy
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +16,7 @@ from rig import IDEAL_CONFIG
 
 from canwall.record import Phase
 from canwall.walls import LAWS, WALL, UnknownLawError, find_law, set_plant, set_referent, wall_force
+from canwall.walls.user_law import load_law
 from canwall.workbench import Ball, sampled_ball, simulate_ball
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "my_law.py"
@@ -376,6 +379,19 @@ def test_one_line_for_a_file_that_is_not_there(tmp_path: Path) -> None:
         with pytest.raises(UnknownLawError) as caught:
             find_law(f"{file}:mine")
         assert str(caught.value) == f"{file}:mine: {complaint}"
+
+
+def test_law_that_was_written_anew_is_the_new_one(
+    write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the same size and within the same second, by which Python would know its bytecode."""
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)
+    for force in (1.0, 2.0):
+        write(f"def mine(wall):\n    return {force}\n")
+        os.utime(tmp_path / "mine.py", (0, 0))
+        law = load_law(tmp_path / "mine.py", "mine")
+        assert wall_force(law.address, np.zeros(1, WALL)[0]) == force
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.py"]
 
 
 def test_own_law_has_no_deadbeat(write: Write) -> None:
