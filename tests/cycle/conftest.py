@@ -8,11 +8,16 @@ from rig import Rig, RigFactory
 
 
 @pytest.fixture(params=["python-can", "native"])
-def make_rig(request: pytest.FixtureRequest) -> Iterator[RigFactory]:
+def native(request: pytest.FixtureRequest) -> bool:
+    return bool(request.param == "native")
+
+
+@pytest.fixture
+def make_rig(native: bool) -> Iterator[RigFactory]:
     with contextlib.ExitStack() as stack:
 
         def make(*args: object, **kwargs: object) -> Rig:
-            rig = Rig(*args, native=request.param == "native", **kwargs)  # type: ignore[arg-type]
+            rig = Rig(*args, native=native, **kwargs)  # type: ignore[arg-type]
             stack.callback(rig.close)
             return rig
 

@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import CodeType, FrameType
@@ -17,7 +17,7 @@ from typing import Any
 
 import can
 import pytest
-from rig import SDO_REQUEST, Loop, Rig, RigFactory, settings_with
+from rig import SDO_REQUEST, Loop, Rig, settings_with
 
 import canwall
 from canwall.cycle import Outcome, run_loop
@@ -159,7 +159,7 @@ def kinds() -> dict[str, Callable[[], None]]:
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("kind", kinds())
-def test_fault_at_every_call(make_rig: RigFactory, kind: str, way: str) -> None:
+def test_fault_at_every_call(native: bool, kind: str, way: str) -> None:
     settings = settings_with(
         {
             "wall.law": "half_sample",
@@ -168,16 +168,18 @@ def test_fault_at_every_call(make_rig: RigFactory, kind: str, way: str) -> None:
         }
     )
 
-    def tried(fault: Fault, outcome: Outcome, way: str) -> Rig:
-        rig: Rig = make_rig(settings)
-        with suppress(ValueError, ForeignError), stop_on_signals():
-            render(rig, fault, WAYS[way], outcome)
-        return rig
+    @contextmanager
+    def tried(fault: Fault, outcome: Outcome, way: str) -> Iterator[Rig]:
+        # One at a time: each run collects garbage, and would visit all rigs that there are.
+        with closing(Rig(settings, native=native)) as rig:
+            with suppress(ValueError, ForeignError), stop_on_signals():
+                render(rig, fault, WAYS[way], outcome)
+            yield rig
 
     def places(way: str) -> set[Place]:
         watched = Fault()
-        tried(watched, Outcome(), way)
-        return set(watched.places)
+        with tried(watched, Outcome(), way):
+            return set(watched.places)
 
     # What the ways have in common is tried on the first of them.
     others = list(WAYS)[: list(WAYS).index(way)]
@@ -189,19 +191,19 @@ def test_fault_at_every_call(make_rig: RigFactory, kind: str, way: str) -> None:
         happens = kinds()[kind] if kind != "hang" else lambda released=released: released.wait(60)
         fault, outcome = Fault(place, happens), Outcome()
         try:
-            rig = tried(fault, outcome, way)
-            said = [*outcome.trips, *outcome.notes]
-            at_rest = drive_is_at_rest(rig)
-            # What is absorbed, by canopen for one, leaves everything in order.
-            told = bool(said) or (outcome.disabled and outcome.error is None)
-            confirmed = outcome.disabled or any("switch it off" in line for line in said)
-            released.set()
-            for thread in given_up:
-                thread.join(5.0)
-            # What has come back does nothing more.
-            still = drive_is_at_rest(rig) and not any(thread.is_alive() for thread in given_up)
-            if not (at_rest and told and confirmed and still):
-                failed.append((place, at_rest, told, confirmed, still, said))
+            with tried(fault, outcome, way) as rig:
+                said = [*outcome.trips, *outcome.notes]
+                at_rest = drive_is_at_rest(rig)
+                # What is absorbed, by canopen for one, leaves everything in order.
+                told = bool(said) or (outcome.disabled and outcome.error is None)
+                confirmed = outcome.disabled or any("switch it off" in line for line in said)
+                released.set()
+                for thread in given_up:
+                    thread.join(5.0)
+                # What has come back does nothing more.
+                still = drive_is_at_rest(rig) and not any(thread.is_alive() for thread in given_up)
+                if not (at_rest and told and confirmed and still):
+                    failed.append((place, at_rest, told, confirmed, still, said))
         except Exception as error:
             failed.append((place, error))
         finally:
