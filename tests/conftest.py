@@ -6,27 +6,24 @@ makes the exit code that of an internal error: scripts/test has no second run fo
 
 import contextlib
 import gc
-import pickle
 import re
 import signal
 import subprocess
 import sys
 import types
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import fork_server
 import hypothesis
 import pytest
 import rig
-from canopen.objectdictionary import ObjectDictionary
 from commands import GUARD_SAID, Record, Start, installed_command
-from fork_server import PYTHON, ForkedPopen
+from fork_server import PYTHON, ForkedPopen, eds_read_once
 from rig import Rig, RigFactory
 
 import canwall.record.recorder
-from canwall.eds import load_eds
 from canwall.run import assembly
 from canwall.simdrive.communication import dictionary
 
@@ -130,21 +127,8 @@ def _forked_writers() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def _dictionaries_read_once() -> Iterator[None]:
-    """Read each EDS once: most of the time that a rig takes.
-
-    Each call has a dictionary of its own.
-    """
-    read: dict[tuple[object, ...], bytes] = {}
-
-    def load_once(path: Path, node_id: int, required: Iterable[int] = ()) -> ObjectDictionary:
-        if not path.is_file():
-            return load_eds(path, node_id, required)
-        found, objects = path.stat(), tuple(required)
-        key = (path, found.st_mtime_ns, found.st_size, node_id, objects)
-        if key not in read:
-            read[key] = pickle.dumps(load_eds(path, node_id, objects))
-        return cast(ObjectDictionary, pickle.loads(read[key]))
-
+    """Read each EDS once: most of the time that a rig takes."""
+    load_once = eds_read_once()
     with pytest.MonkeyPatch.context() as patch:
         for user in (rig, assembly, dictionary):
             patch.setattr(user, "load_eds", load_once)

@@ -3,8 +3,9 @@
 `ForkedPopen` is `subprocess.Popen` for commands of this Python and of the scripts installed beside
 it. The process is a real one: a child of the caller with standard streams, folder, environment,
 session and signals of its own, that ends as an interpreter does. Only the start of the interpreter
-and the imports are left out, which take seconds. Tests of these use `subprocess.Popen`, and so do
-tests of what libraries decide as they are imported (from MPLCONFIGDIR, NUMBA_CPU_NAME, TERM).
+and the imports, which take seconds, are left out, and the reading of the shipped EDS. Tests of
+these use `subprocess.Popen`, and so do tests of what libraries decide as they are imported (from
+MPLCONFIGDIR, NUMBA_CPU_NAME, TERM).
 
 This file is also the program of the server that forks them, and has nothing else to do meanwhile.
 """
@@ -16,6 +17,7 @@ import gc
 import io
 import json
 import os
+import pickle
 import runpy
 import signal
 import socket
@@ -26,11 +28,14 @@ import threading
 import traceback
 import types
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, AnyStr, NoReturn, TextIO
+from typing import TYPE_CHECKING, Any, AnyStr, NoReturn, TextIO, cast
+
+if TYPE_CHECKING:
+    from canopen.objectdictionary import ObjectDictionary
 
 PYTHON = Path(sys.executable)
 #: The installed command, a script of Python like `dask`.
@@ -232,11 +237,29 @@ def _take_orphans(yes: bool) -> None:
         raise OSError("prctl: PR_SET_CHILD_SUBREAPER is refused")
 
 
+def eds_read_once() -> "Callable[..., ObjectDictionary]":
+    """Return a `load_eds` that reads each file once; each call has a dictionary of its own."""
+    from canwall.eds import load_eds
+
+    read: dict[tuple[object, ...], bytes] = {}
+
+    def load_once(path: Path, node_id: int, required: Iterable[int] = ()) -> "ObjectDictionary":
+        if not path.is_file():
+            return load_eds(path, node_id, required)
+        found, objects = path.stat(), tuple(required)
+        key = (path.resolve(), found.st_mtime_ns, found.st_size, node_id, objects)
+        if key not in read:
+            read[key] = pickle.dumps(load_eds(path, node_id, objects))
+        return cast("ObjectDictionary", pickle.loads(read[key]))
+
+    return load_once
+
+
 # The server
 
 
 def load() -> None:
-    """Import what the commands import, and have their compiled code loaded."""
+    """Import what the commands import, have their compiled code loaded, and the EDS read."""
     import distributed  # noqa: F401
     import h5netcdf  # noqa: F401
     import matplotlib.pyplot  # noqa: F401
@@ -250,9 +273,11 @@ def load() -> None:
     import canwall.workbench
     from canwall import config
     from canwall.record.pictures import warm_up
-    from canwall.run import run
+    from canwall.run import assembly, run
+    from canwall.simdrive.communication import dictionary
 
     warm_up()
+    assembly.load_eds = dictionary.load_eds = eds_read_once()  # type: ignore[attr-defined]
     forking = types.SimpleNamespace(**{**vars(subprocess), "Popen": PopenByFork})
     canwall.record.recorder.subprocess = forking  # type: ignore[attr-defined]
     for exchange in ("python-can", "native"):
