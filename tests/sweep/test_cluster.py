@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from commands import COMMAND, command, python, wait_for
+from commands import COMMAND, Start, command, python, wait_for
 from fork_server import ForkedPopen
 from rig import SIM_CONFIG
 
@@ -232,17 +232,14 @@ def test_law_that_has_changed_since_a_worker_read_it_is_not_computed_with(
     assert not list(tmp_path.glob("b.nc*"))
 
 
-def test_ctrl_c_ends_a_sweep_by_frames(tmp_path: Path) -> None:
+def test_ctrl_c_ends_a_sweep_by_frames(start: Start, tmp_path: Path) -> None:
     """Within a piece, whose processes end with it; what is done is kept."""
     output = tmp_path / "a.nc"
     sweep = ("sweep", SIM_CONFIG, "--through", "bus", "--law", "standard")
-    process = subprocess.Popen(
-        [COMMAND, *map(str, sweep), "--stiffness", "1:100:400", "--output", str(output)],
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = start(COMMAND, *sweep, "--stiffness", "1:100:400", "--output", output)
     journal = tmp_path / "a.nc.partial"
-    wait_for(lambda: journal.exists() and len(journal.read_bytes().splitlines()) > 1)
+    # Of two, one is kept even if Ctrl-C comes as the other is being written.
+    wait_for_pieces(output, process)
     began_s = time.monotonic()
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=PATIENCE_S)
