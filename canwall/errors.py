@@ -15,12 +15,12 @@ def one_line(text: str) -> str:
     return _cut(re.sub(r"\S+", lambda word: _cut(word[0], _WORD), printable), _TEXT)
 
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
+def did_you_mean(name: object, known: Iterable[str]) -> str:
     """Return the end of a message about an unknown name: the known one that is closest.
 
     It is empty if none is close.
     """
-    close = difflib.get_close_matches(name, list(known), n=1)
+    close = difflib.get_close_matches(str(name), list(known), n=1)
     return f"; did you mean {close[0]}?" if close else ""
 
 

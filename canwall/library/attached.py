@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from canwall.errors import ConfigError
 from canwall.extras import need
+from canwall.library.arguments import as_dict, as_path
 from canwall.library.laws import LawLike, law_name
 from canwall.record.columns import ROW, UNITS, record_batch
 from canwall.record.live import LiveRun, LiveSettings
@@ -32,7 +33,7 @@ def attach(folder: str | os.PathLike[str]) -> "AttachedRun":
     Raises:
         canwall.errors.ConfigError: If no run that writes the folder is in progress.
     """
-    return AttachedRun(LiveRun.open(Path(folder)))
+    return AttachedRun(LiveRun.open(as_path("folder", folder)))
 
 
 class AttachedRun:
@@ -116,7 +117,7 @@ class AttachedRun:
             "stiffness_nm_per_rad": stiffness,
             "damping_nm_s_per_rad": damping,
             "position_rad": position,
-            "options": None if options is None else dict(options),
+            "options": None if options is None else as_dict("options", options),
         }
         given = {key: value for key, value in given.items() if value is not None}
         if "do" in keys:
@@ -129,7 +130,8 @@ class AttachedRun:
         Each has keys of `[[schedule]]`, and applies to the wall in force: `{"law": "standard"},
         {"law": "half_sample"}`. Returns and raises as `change`.
         """
-        return self.live.request({"do": "take_turns", "walls": [dict(wall) for wall in walls]})
+        given = [as_dict(f"walls.{i}", wall) for i, wall in enumerate(walls)]
+        return self.live.request({"do": "take_turns", "walls": given})
 
     def mark(self, text: str) -> int:
         """Write a line into the run's events.jsonl; return its cycle. Raises as `change`."""

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 import xarray as xr
 
+from canwall.library.arguments import as_dict
 from canwall.library.laws import LawLike, law_name
 from canwall.workbench import CONTINUOUS, Ball, simulate_ball
 
@@ -75,7 +76,7 @@ def ball(
         passivity=passivity,
     )
     name = law if law == CONTINUOUS else law_name(law)
-    y, v, force = simulate_ball(dropped, str(name), deadbeat, options)
+    y, v, force = simulate_ball(dropped, str(name), deadbeat, as_dict("options", options))
     variables = {
         "y": (y, "m", "height above the floor"),
         "v": (v, "m/s", "velocity, upwards"),

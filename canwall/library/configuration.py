@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from canwall import config as settings_room
-from canwall.config import ConfigError, Settings
+from canwall.config import Settings
+from canwall.library.arguments import as_dict, as_path
 from canwall.library.laws import LawLike, law_name
 from canwall.walls import Law
 
@@ -33,18 +34,15 @@ def load(config: Config = None, overrides: Mapping[str, Any] | None = None) -> S
     if isinstance(config, Settings):
         settings = config
     else:
-        try:
-            path = settings_room.shipped("config/sim.toml") if config is None else Path(config)
-        except TypeError:
-            raise ConfigError(
-                f"a configuration is a path or settings, not {type(config).__name__}; give values "
-                "by dotted key as overrides"
-            ) from None
+        expected = "a path or settings (values by dotted key are overrides)"
+        default = settings_room.shipped("config/sim.toml")
+        path = default if config is None else as_path("config", config, expected)
         settings = settings_room.load(path)
-    if not overrides:
+    given = as_dict("overrides", overrides)
+    if not given:
         return settings
     return settings_room.with_overrides(
-        settings, {key: _from_here(key, value) for key, value in overrides.items()}
+        settings, {key: _from_here(key, value) for key, value in given.items()}
     )
 
 
@@ -52,7 +50,7 @@ def _from_here(key: str, value: Any) -> Any:
     """Return a value with paths resolved, and a law by its name."""
     if key == "wall.law" or isinstance(value, Law):
         return law_name(value)
-    if key in ("drive.eds", "simulation.store"):
+    if key in ("drive.eds", "simulation.store") and isinstance(value, str | os.PathLike):
         return Path(value).resolve()
     return value
 

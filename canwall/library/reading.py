@@ -1,9 +1,9 @@
 """Reading of what runs and sweeps leave behind."""
 
 import os
-from pathlib import Path
 from typing import TYPE_CHECKING
 
+from canwall.library.arguments import as_path
 from canwall.library.recorded import RecordedRun
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ def read(path: str | os.PathLike[str]) -> "RecordedRun | xr.Dataset":
         canwall.errors.InputError: If there is neither, or it is damaged.
         canwall.errors.RunFailedError: If the folder of a run that was cut off cannot be completed.
     """
-    path = Path(path)
+    path = as_path("path", path)
     if path.suffix == ".nc":
         from canwall.sweep import read_sweep
 

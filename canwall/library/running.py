@@ -4,12 +4,12 @@ import os
 import threading
 import warnings
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import can
 
 from canwall.errors import InputError, RunFailedError, RunWarning, TrippedError
+from canwall.library.arguments import as_path
 from canwall.library.configuration import Config, wall_settings
 from canwall.library.laws import LawLike
 from canwall.library.progress import Progress
@@ -68,7 +68,7 @@ def run(
         )
     if output == "":
         raise InputError("output: is empty, and would be the working directory; give a folder")
-    folder = None if output is None else Path(output)
+    folder = None if output is None else as_path("output", output)
     settings = wall_settings(config, overrides, law, stiffness, damping, duration, options)
     with stop_on_signals(held=False) as stop:
         try:

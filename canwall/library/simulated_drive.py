@@ -16,6 +16,7 @@ from canwall.bus import open_bus
 from canwall.config import Bus, Drive, Fault, Settings, Simulation, first_error, shipped
 from canwall.errors import ConfigError
 from canwall.faults import KINDS, FaultKind
+from canwall.library.arguments import as_dict, as_path
 from canwall.realtime import real_time_priority
 from canwall.simdrive import (
     BusRunner,
@@ -104,12 +105,12 @@ class SimulatedDrive:
             if interface != "virtual":
                 raise ConfigError(f"channel is missing: {interface} has none of its own")
             channel = f"canwall-{next(_numbers)}"
-        described = {"real_time": real_time, "hand": _NOBODY} | dict(simulation or {})
+        described = {"real_time": real_time, "hand": _NOBODY} | as_dict("simulation", simulation)
         bus = _section(Bus, interface=interface, channel=channel, bitrate=bitrate, cycle_s=cycle_s)
         drive = _section(
             Drive,
             node_id=node_id,
-            eds=Path(eds or shipped("eds/canwall-drive.eds")).resolve(),
+            eds=as_path("eds", eds or shipped("eds/canwall-drive.eds")).resolve(),
             rated_torque_unit_nm=rated_torque_unit_nm,
         )
         self.node_id, self.eds = drive.node_id, drive.eds

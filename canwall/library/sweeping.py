@@ -11,12 +11,13 @@ import numpy as np
 import xarray as xr
 
 from canwall.errors import InputError
+from canwall.library.arguments import as_dict, as_list, as_path
 from canwall.library.configuration import Config, load
 from canwall.library.laws import LawLike, law_name
 from canwall.library.progress import Progress
 from canwall.sweep import OPERATORS, compute_law_table, make_plan
 from canwall.sweep import sweep as run_sweep
-from canwall.walls import Law, is_declared
+from canwall.walls import is_declared
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -72,16 +73,17 @@ def sweep(
         raise InputError("resume: give the output of the sweep that is to be continued")
     settings = load(config, overrides)
     given = {
-        "law": None if law is None else [law_name(one) for one in _several(law)],
+        "law": None if law is None else [law_name(one) for one in as_list(law)],
         "stiffness": stiffness,
         "damping": damping,
         "rate": rate,
         "operator": operator,
     }
-    for name in axes or {}:
+    further = as_dict("axes", axes)
+    for name in further:
         if given.get(name) is not None:
             raise InputError(f"sweep axis {name}: is given twice; keep one")
-    given |= axes or {}
+    given |= further
     plan = make_plan(
         settings, {name: _plain(v) for name, v in given.items() if v is not None}, through
     )
@@ -90,7 +92,7 @@ def sweep(
     with Progress(progress) as display, TemporaryDirectory(prefix="canwall-") as folder:
         return run_sweep(
             plan,
-            Path(folder, "sweep.nc") if output is None else Path(output),
+            Path(folder, "sweep.nc") if output is None else as_path("output", output),
             resume,
             workers,
             dask,
@@ -130,13 +132,13 @@ def law_table(
         canwall.errors.InputError: For a table, a law or an operator that does not exist.
     """
     settings = load(config, overrides)
-    laws = [law_name(one) for one in _several(law)]
+    laws = [law_name(one) for one in as_list(law)]
     if through != "sim" or dask is not None:
         _refuse_declared(laws)
     with Progress(progress) as display:
         count = partial(display.count, "striking walls")
         return compute_law_table(
-            name, settings, laws, _several(operator), through, workers, dask, count
+            name, settings, laws, as_list(operator), through, workers, dask, count
         )
 
 
@@ -153,10 +155,6 @@ def sweep_figures(dataset: xr.Dataset) -> "dict[str, Figure]":
     from canwall.sweep.figures import draw_sweep
 
     return {name: shown_in_notebooks(figure) for name, figure in draw_sweep(dataset)}
-
-
-def _several(given: Any) -> list[Any]:
-    return [given] if isinstance(given, str | Law) else list(given)
 
 
 def _plain(values: object) -> object:

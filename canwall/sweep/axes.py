@@ -127,6 +127,9 @@ def parse_axis(name: str, given: object) -> SweepAxis:
         values = tuple(v for part in given.split(",") for v in _parse_part(name, part.strip()))
     elif isinstance(given, Sequence):
         values = tuple(v for part in given for v in parse_axis(name, part).values)
+    elif isinstance(given, dict | set):
+        what = type(given).__name__
+        raise InputError(f"sweep axis {name}: has to have numbers or text as values, not {what}")
     else:
         values = (given,)  # type: ignore[assignment]
     if not values or "" in values:
@@ -173,7 +176,7 @@ def _check(name: str, value: Value) -> None:
         if value not in _CHOICES[name]:
             raise InputError(
                 f"sweep axis {name}: has to be one of {', '.join(_CHOICES[name])}, not {value!r}"
-                f"{did_you_mean(str(value), _CHOICES[name])}"
+                f"{did_you_mean(value, _CHOICES[name])}"
             )
         return
     if name not in NAMED or name == "law":

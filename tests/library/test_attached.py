@@ -51,6 +51,8 @@ def test_attached_run(start: Start, tmp_path: Path) -> None:
             run.change(do="end")
         assert "12.5 N·m/rad; rendering, cycle" in repr(run)
         turns = run.take_turns({"stiffness_nm_per_rad": 3.0}, {"stiffness_nm_per_rad": 4.0})
+        with pytest.raises(ConfigError, match=r"walls\.0: has to be a dictionary"):
+            run.take_turns("ab")  # type: ignore[arg-type]
         assert run.watch_beat(0) >= turns
         run.end()
         assert process.wait(PATIENCE_S) == 128 + signal.SIGINT

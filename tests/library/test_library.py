@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -95,8 +96,44 @@ def test_what_cannot_be_loaded_is_an_input_error(overrides: dict[str, Any], comp
         canwall.load(None, overrides)
 
 
+def test_a_path_may_be_left_out() -> None:
+    settings = canwall.load(None, {"simulation.store": None})
+    assert settings == canwall.load()
+
+
+@pytest.mark.parametrize(
+    ("function", "given", "complaint"),
+    [
+        (canwall.load, {"overrides": ["wall.law"]}, "overrides: has to be a dict.*, not list"),
+        (canwall.load, {"overrides": {3: 1}}, "overrides: has to be a dictionary with names"),
+        (canwall.load, {"overrides": {"drive.eds": None}}, "drive.eds: has to be a path"),
+        (canwall.run, {"overrides": "ab"}, "overrides: has to be a dictionary"),
+        (canwall.run, {"output": 3}, "output: has to be a path, not int"),
+        (canwall.run, {"law": 3}, "law: 3 is no law"),
+        (canwall.sweep, {"axes": ["rate"]}, "axes: has to be a dict.*, not list"),
+        (canwall.sweep, {"law": 3}, "law: 3 is no law"),
+        (canwall.sweep, {"rate": {1, 2}}, "sweep axis rate: .* numbers or text .*, not set"),
+        (canwall.sweep, {"output": 3}, "output: has to be a path"),
+        (canwall.law_table, {"name": 3}, "--table 3: has to be one of laws"),
+        (canwall.law_table, {"name": "laws", "operator": 3}, "operator: has to be one of none"),
+        (canwall.ball, {"law": "standard", "options": ["a"]}, "options: has to be a dictionary"),
+        (canwall.read, {"path": 3}, "path: has to be a path, not int"),
+        (canwall.attach, {"folder": 3}, "folder: has to be a path, not int"),
+        (canwall.SimulatedDrive, {"eds": 3}, "eds: has to be a path, not int"),
+        (canwall.SimulatedDrive, {"simulation": 3}, "simulation: has to be a dictionary"),
+    ],
+)
+def test_argument_of_another_type(
+    function: Callable[..., object], given: dict[str, object], complaint: str
+) -> None:
+    with pytest.raises(InputError, match=complaint):
+        function(**given)
+
+
 def test_a_dictionary_is_no_configuration() -> None:
-    with pytest.raises(InputError, match="path or settings, not dict; give values by dotted key"):
+    with pytest.raises(
+        InputError, match=r"path or settings \(values by dotted key are overrides\), not"
+    ):
         canwall.load({"wall.law": "midpoint"})  # type: ignore[arg-type]
 
 
