@@ -1,8 +1,9 @@
 """Commands in which a person at the handle judges walls: `study staircase` and others."""
 
+import contextlib
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,6 +15,7 @@ from canwall.cli.ending import failed_if
 from canwall.cli.options import ConfigFile, JsonOption, folder_path, settings_from
 from canwall.cli.output import console, print_json
 from canwall.cli.program import make_program
+from canwall.errors import InputError
 from canwall.extras import need
 from canwall.stopping import INTERRUPTED
 
@@ -37,6 +39,15 @@ _Laws = Annotated[
         autocompletion=complete_law,
     ),
 ]
+#: Options, by what errors call their values.
+_OPTIONS = {
+    "factors": "--factor",
+    "question": "--question",
+    "repeats": "--repeats",
+    "seed": "--seed",
+    "sweep axis stiffness": "--stiffness",
+    "walls": "--law",
+}
 #: First wall of a staircase, unless that of the file is softer [N·m/rad].
 _SOFT = 5.0
 _Seconds = Annotated[
@@ -92,7 +103,8 @@ def alternating(
     from canwall.study import run_alternating
     from canwall.sweep.axes import parse_axis  # "LO:HI:N" as in a sweep
 
-    walls = [float(value) for value in parse_axis("stiffness", stiffness).values]
+    with _naming_options():
+        walls = [float(value) for value in parse_axis("stiffness", stiffness).values]
     return _run_session(
         config_file, law, output, seconds, as_json, lambda session: run_alternating(session, walls)
     )
@@ -124,12 +136,17 @@ def comparison(
     comparison.csv; at the end the table has the share of the trials in which each wall was chosen,
     and the psychometric function.
     """
+    if law and factor:
+        raise InputError("--law and --factor: keep one of them")
     settings = settings_from(config_file)
-    from canwall.config import absolute_law
+    from canwall.cycle import law_of, named_law, with_law
     from canwall.panel.at_the_terminal import compare_at_terminal
     from canwall.record import RunFolder
 
-    laws = tuple(absolute_law(name, Path()) for name in law or [])
+    others = [with_law(settings, name) for name in law or []]
+    for other in others:
+        law_of(other.wall)
+    laws = tuple(map(named_law, others))
     asked: dict[str, Any] = {"procedure": "comparison", "question": question, "repeats": repeats}
     asked |= {"seed": seed, "walls": [{"law": name} for name in laws]}
     asked |= {"factors": factor} if factor else {}
@@ -137,7 +154,8 @@ def comparison(
     settings = settings.model_copy(
         update={"schedule": (), "run": settings.run.model_copy(update=more)}
     )
-    compared = compare_at_terminal(settings, RunFolder(output), asked, _terminal(as_json))
+    with _naming_options():
+        compared = compare_at_terminal(settings, RunFolder(output), asked, _terminal(as_json))
     if as_json:
         print_json({"record": compared.result.folder.path} | compared.found)
     else:
@@ -145,6 +163,18 @@ def comparison(
     result = compared.result
     failed = failed_if([*result.outcome.trips, *result.not_restored, *result.notes])
     return failed or (INTERRUPTED if compared.interrupted else 0)
+
+
+@contextlib.contextmanager
+def _naming_options() -> Iterator[None]:
+    """Have errors name the options of a value instead of what it becomes."""
+    try:
+        yield
+    except InputError as error:
+        key, _, what = str(error).partition(":")
+        if option := _OPTIONS.get(key.partition(".")[0]):
+            raise InputError(f"{option}:{what}") from None
+        raise
 
 
 def _run_session(

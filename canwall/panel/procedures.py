@@ -155,6 +155,9 @@ class TwoAlternatives:
         self._asked = asked
         changes = [asked.reference, *(asked.walls or _by_factor(asked, wall))]
         self._reference, *walls, self.restoring = completed(changes, wall)
+        if any(one in walls[:i] for i, one in enumerate(walls)):
+            key = "walls" if asked.walls else "factors"
+            raise ConfigError(f"{key}: two of them are the same wall; leave one out")
         self._pairs = [_Pair(one) for one in walls]
         trials = len(walls) * asked.repeats
         if trials > _MOST_TRIALS:

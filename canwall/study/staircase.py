@@ -51,7 +51,9 @@ class Staircase:
     finest: float
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.start <= self.ceiling < math.inf:
+        if not 0.0 < self.ceiling < math.inf:
+            raise InputError(f"--ceiling {self.ceiling:g}: has to be a finite number above 0")
+        if not 0.0 < self.start <= self.ceiling:
             raise InputError(
                 f"--start {self.start:g}: has to be above 0 and at most the ceiling, "
                 f"{self.ceiling:g}"

@@ -264,7 +264,15 @@ def test_staircases_of_two_laws_are_those_of_the_study(tmp_path: Path) -> None:
             "walls and factors are given; keep one of them",
         ),
         ({"procedure": "comparison", "repeats": 0}, "repeats: has to be"),
-        ({"procedure": "comparison", "repeats": 100, "factors": [2.0] * 11}, "1100 trials"),
+        ({"procedure": "comparison", "repeats": 100, "factors": [*range(2, 13)]}, "1100 trials"),
+        ({"procedure": "comparison", "factors": [2, 3, 2.0]}, "factors: two of them are the same"),
+        (
+            {
+                "procedure": "comparison",
+                "walls": [{"cap": 0.8}, {"cap": 0.8, "damping_ratio": 0.3}],
+            },
+            "walls: two of them are the same wall",
+        ),
         ({"procedure": "staircase", "start": 600}, "start 600: has to be"),
         ({"procedure": "staircase", "finest": 1}, "finest 1: has to be"),
     ],

@@ -342,16 +342,23 @@ def test_ctrl_c_between_two_walls(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "line"),
+    ("study", "arguments", "line"),
     [
-        (["--law", "none"], "wall.law: unknown law 'none'"),
-        (["--output", "/proc/none"], "/proc/none: cannot be written"),
+        ("staircase", "--law none", "wall.law: unknown law 'none'"),
+        ("staircase", "--output /proc/none", "/proc/none: cannot be written"),
+        ("alternating", "--stiffness 5,5", "--stiffness: has a value twice"),
+        ("comparison", "--factor 2 --factor -1", "--factor: has to be greater than 0, not -1"),
+        ("comparison", "--factor 2 --factor 2", "--factor: two of them are the same wall"),
+        ("comparison", "--law damped --law damped", "--law: two of them are the same wall"),
+        ("comparison", "--law damped --factor 2", "--law and --factor: keep one of them"),
+        ("comparison", "--law none", "wall.law: unknown law 'none'"),
+        ("comparison", "--repeats 0", "--repeats: has to be greater than or equal to 1"),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(
-    folder: Path, arguments: list[str], line: str
+    folder: Path, study: str, arguments: str, line: str
 ) -> None:
-    code, _, errors = Person("staircase", folder, *arguments).end()
+    code, _, errors = Person(study, folder, *arguments.split()).end()
     assert code == 2
     assert errors.startswith(f"canwall: {line}")
     assert len(errors.splitlines()) == 1
@@ -420,7 +427,8 @@ def test_limits_are_the_stiffest_free_and_the_softest_that_is_not() -> None:
     [
         (0.0, 10.0, 1.1, "--start 0: has to be above 0"),
         (20.0, 10.0, 1.1, "at most the ceiling, 10"),
-        (1.0, float("inf"), 1.1, "at most the ceiling, inf"),
+        (1.0, float("inf"), 1.1, "--ceiling inf: has to be a finite number above 0"),
+        (-1.0, -1.0, 1.1, "--ceiling -1: has to be a finite number above 0"),
         (1.0, 2.0, 1.0, "--finest 1: has to be a factor above 1"),
     ],
 )
