@@ -204,7 +204,10 @@ class _Supervisor:
         """Have the loop run to its end, or to that of this thread's patience."""
         loop, by_loop = self._loop, Outcome()
         with real_time_priority(above_loop=True) if loop.real_time else nullcontext():
-            call = Call(lambda: _run(loop, work, prepared, by_loop), lambda: loop.progress)
+            call = Call(
+                lambda: _run(loop, work, prepared, by_loop),
+                lambda: (loop.progress, loop.law_at_work()),
+            )
             why = self._attend(call, partial(_hang, loop))
             # The thread of the loop may still come back, and have something to add.
             ended = replace(by_loop, trips=[*by_loop.trips], notes=[*by_loop.notes])
@@ -246,7 +249,9 @@ class _Supervisor:
 def _hang(loop: Loop, call: Call) -> str:
     """Return why the loop counts as hanging, with the law that does not return; else empty."""
     limit_s = max(_LAW_S, _LAW_CYCLES * loop.period_s) if loop.real_time else _SIMULATED_LAW_S
-    if call.computed_s >= limit_s and (evaluating := loop.law_at_work()):
+    # What was computed before an evaluation, as code that was compiled, is no law's.
+    _, evaluating = call.seen
+    if evaluating and call.computed_s >= limit_s:
         return f"{evaluating} has not returned for {call.computed_s:.2g} s"
     return _standstill(call)
 

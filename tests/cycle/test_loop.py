@@ -4,6 +4,7 @@ import gc
 import struct
 import time
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import can
@@ -15,7 +16,7 @@ from rig import RPDO1, SDO_REQUEST, SYNC, TPDO1, Loop, Rig, RigFactory, lack, se
 
 from canwall.bus.can_ids import NMT
 from canwall.config import Settings
-from canwall.cycle import Outcome, WallStage, run_loop
+from canwall.cycle import Outcome, WallStage, run_loop, way_out
 from canwall.cycle import exchange as exchange_module
 from canwall.record import Phase
 
@@ -721,3 +722,11 @@ def test_late_rpdos_with_one_in_time_among_them(make_rig: RigFactory) -> None:
     outcome = loop.run(None, lambda j: loop.axis.late_rpdo >= 60)
     assert outcome.trips == []
     assert loop.axis.late_rpdo >= 60
+
+
+def test_law_is_not_blamed_for_what_was_computed_before_it() -> None:
+    loop: Any = SimpleNamespace(real_time=False, law_at_work=lambda: "cycle 9: law late")
+    call: Any = SimpleNamespace(computed_s=1.0, waited_s=0.0, seen=(1, ""))
+    assert way_out._hang(loop, call) == ""
+    call.seen = 1, "cycle 8: law endless"
+    assert way_out._hang(loop, call) == "cycle 8: law endless has not returned for 1 s"
