@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from canwall.cli.completion import complete_law
-from canwall.cli.options import JsonOption, refuse_to_overwrite, refuse_what_exists
+from canwall.cli.options import JsonOption, refuse_what_exists
 from canwall.cli.output import ProgressDisplay, console, print_json
 from canwall.errors import InputError
 from canwall.extras import need
@@ -38,7 +38,7 @@ def ball(
     as_json: JsonOption = False,
 ) -> int:
     """Simulate a ball that bounces on the wall as its floor: exact state, no delay, held force."""
-    refuse_to_overwrite(output)
+    refuse_what_exists(output)
     from canwall.config import absolute_law
     from canwall.workbench import CONTINUOUS, Ball, simulate_ball, write_ball
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from canwall.compiled import Record, compiled
 from canwall.errors import InputError, RunFailedError, did_you_mean
 from canwall.physics import advance, make_plant
+from canwall.record.folder import RecordError, whole_file
 from canwall.supervised import interruptible
 from canwall.walls import (
     TENSION,
@@ -150,12 +151,16 @@ def simulate_ball(
 
 
 def write_ball(path: Path, ball: Ball, y: Array, v: Array, force: Array) -> None:
-    """Write a CSV file with columns t, y, v, f in full precision. Raises InputError."""
+    """Write a CSV file with columns t, y, v, f in full precision, whole or not at all.
+
+    Raises InputError if it cannot be written.
+    """
     table = np.column_stack([np.arange(len(y)) * ball.period, y, v, force])
     try:
-        np.savetxt(path, table, fmt="%.17g", delimiter=",", header="t,y,v,f", comments="")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+        with whole_file(path) as file:
+            np.savetxt(file, table, fmt="%.17g", delimiter=",", header="t,y,v,f", comments="")
+    except RecordError as error:
+        raise InputError(str(error)) from None
 
 
 def sampled_ball(

@@ -1,9 +1,11 @@
 """`canwall ball`: its file, its line, its errors."""
 
+import errno
 import os
 import threading
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -208,14 +210,30 @@ def test_one_line_for_what_is_wrong(bounce: Bounce, wrong: str, complaint: str) 
 
 
 def test_one_line_for_a_file_that_cannot_be_written(bounce: Bounce, tmp_path: Path) -> None:
-    for file, reason in (
-        (tmp_path, "Is a directory"),
-        (tmp_path / "nowhere" / "ball.csv", "No such file or directory"),
+    for file, what in (
+        (tmp_path, "exists already; choose another --output"),
+        (tmp_path / "nowhere" / "ball.csv", "cannot be written: No such file or directory"),
     ):
         bounce.file = file
         said = bounce("--law", "standard")
         assert (said.code, said.out) == (2, "")
-        assert said.err == f"canwall: {file}: cannot be written: {reason}\n"
+        assert said.err == f"canwall: {file}: {what}\n"
+
+
+def test_file_is_whole_or_not_there(
+    bounce: Bounce, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    savetxt = np.savetxt
+
+    def fill_the_disk(*given: Any, **more: Any) -> None:
+        savetxt(*given, **more)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(np, "savetxt", fill_the_disk)
+    said = bounce("--law", "standard")
+    why = "cannot be written: No space left on device"
+    assert (said.code, said.err) == (2, f"canwall: {bounce.file}: {why}\n")
+    assert not list(tmp_path.iterdir())
 
 
 def test_one_line_for_a_law_that_cannot_be_compiled(bounce: Bounce, tmp_path: Path) -> None:
