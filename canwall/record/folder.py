@@ -109,6 +109,8 @@ def read_signals(
         except FileNotFoundError:
             table = _read_parquet(path, wanted)
         table.validate(full=True)
+    except NotADirectoryError:
+        raise ConfigError(f"{path.parent}: is a file; give the folder of a run") from None
     except FileNotFoundError:
         raise ConfigError(
             of_several_drives(path.parent) or f"{path}: no such file; give the folder of a run"

@@ -441,6 +441,8 @@ def test_what_is_no_record(tmp_path: Path) -> None:
     folder.signals.write_text("PAR1 or not")
     with pytest.raises(ConfigError, match="not a record of a run"):
         read_signals(folder.signals)
+    with pytest.raises(ConfigError, match=r"signals\.parquet: is a file; give the folder of a run"):
+        read_signals(RunFolder(folder.signals).signals)
     pq.write_table(pa.table({"t_s": [1, 2]}), folder.signals)
     with pytest.raises(ConfigError, match="lacks column j: not a record of a run"):
         read_signals(folder.signals)
