@@ -1,5 +1,6 @@
 """The panel's page in a browser: runs that are compared, the map of a sweep, a blind comparison."""
 
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -60,6 +61,18 @@ def page(browser: "Browser", recorded: Path) -> Iterator[Window]:
             yield opened
 
 
+#: Keeps the left and right ends of the times below a plot, as it draws them [pixels].
+LABELS = """() => {
+  window.labels = [];
+  const draw = CanvasRenderingContext2D.prototype.fillText;
+  CanvasRenderingContext2D.prototype.fillText = function (text, x, ...rest) {
+    const half = this.measureText(text).width / 2;
+    if (text.endsWith(" ms")) window.labels.push([x - half, x + half]);
+    draw.call(this, text, x, ...rest);
+  };
+}"""
+
+
 def pixels(page: Window, canvas: str) -> list[int]:
     """Pixels of a canvas, as numbers from 0 to 255."""
     found: list[int] = page.page.evaluate(
@@ -93,6 +106,8 @@ def test_strike_of_a_point_of_a_map(page: Window) -> None:
     page.wait_for_text("sweep-text", "Click, or press Enter")
     assert page.violations() == []
     page.page.select_option("#sweep-choices select", label="half sample")
+    page.page.evaluate(LABELS)
+    page.page.set_viewport_size({"width": 1230, "height": 900})  # a label every 55 pixels
     place = page.page.locator("#sweep").bounding_box()
     assert place is not None
     with page.page.expect_response("**/strike") as asked:
@@ -103,6 +118,10 @@ def test_strike_of_a_point_of_a_map(page: Window) -> None:
     clicked = page.text("sweep-text")
     assert "differs" not in clicked
     assert page.page.is_visible("#strike-place")
+    wait_until(lambda: bool(page.page.evaluate("() => window.labels.length")))
+    labels = page.page.evaluate("() => window.labels")
+    gaps = [right[0] - left[1] for left, right in itertools.pairwise(labels) if right > left]
+    assert min(gaps) > 8.0
     drawn = pixels(page, "#strike-force canvas")
     page.page.keyboard.press("ArrowDown")
     with page.page.expect_response("**/strike") as asked:

@@ -122,7 +122,7 @@ export function bandOptions({ bands, scales, column, labels = true, decimals, cu
     padding: [8, 24, labels ? 0 : 8, 0],
     scales: { x: { time: false, ...scales.x }, y: { auto: false, ...scales.y } },
     axes: [
-      axis({ size: labels ? 26 : 0, values: (u, ticks) => ticks.map((t) => (labels ? time(t) : "")) }),
+      axis({ size: labels ? 26 : 0, space: 80, values: (u, ticks) => ticks.map((t) => (labels ? time(t) : "")) }),
       axis({ size: 58, space: 26, values: (u, ticks) => ticks.map((value) => fixed(value, decimals(u))) }),
     ],
     cursor: cursor ?? { show: false },
