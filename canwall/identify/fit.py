@@ -103,7 +103,8 @@ def _check_told(found: ServoFit) -> None:
         raise UntellingDataError(
             f"a free handle does not move like this: {residuals.explained:.1%} of the motion is "
             f"explained, the residuals are {residuals.rms:.2g} steps of the encoder, "
-            f"the inertia is known to {uncertain:.0%}; let it go, and see that nothing pulls at it"
+            f"the inertia is known to {uncertain:.0%}; let it go, see that nothing pulls at it, "
+            f"and that the drive does not derate its torque meanwhile"
         )
 
 

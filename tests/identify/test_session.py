@@ -111,6 +111,14 @@ def test_hand_at_the_handle_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_drive_that_derates_its_torque_is_told(tmp_path: Path) -> None:
+    derated = {"kind": "torque", "at_s": 15.0, "amount": 500}
+    settings = config.with_overrides(free_handle(), {"simulation.fault": [derated]})
+    with pytest.raises(UntellingDataError, match="derate its torque"):
+        identify(settings, tmp_path / "record")
+
+
+@pytest.mark.slow
 def test_simulated_hand_lets_go_or_holds_still(tmp_path: Path) -> None:
     """The one of config/sim.toml strikes."""
     for words, does in (
