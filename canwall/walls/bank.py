@@ -278,7 +278,7 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
         residual = y_sample - state[0, i]
         if bank.flies and bank.gain_in_flight[0, i] > 0.0:
             _correct_in_flight(bank, i, residual)
-            _set_shift(bank, i, 0.0, 0.0, 0.0)
+            _end_shift(bank, i)
             continue
         far = residual - min(max(residual, -bank.far), bank.far)
         near = residual - far
@@ -306,7 +306,7 @@ def follow_estimator(bank: Record, estimator: Record) -> None:
     for i in range(bank.count):
         bank.state[0, i], bank.state[1, i] = estimator.y, estimator.v
         bank.state[2, i], bank.trend[i] = estimator.d, 0.0
-        _set_shift(bank, i, 0.0, 0.0, 0.0)
+        _end_shift(bank, i)
 
 
 @compiled
@@ -362,8 +362,17 @@ def _correct_shift(bank: Record, i: int, residual: float, step: float) -> float:
 
 
 @compiled
-def _set_shift(bank: Record, i: int, y: float, v: float, d: float) -> None:
-    bank.shift[0, i], bank.shift[1, i], bank.shift[2, i] = y, v, d
+def _advance_shift(bank: Record, i: int) -> None:
+    phi, older, newer = bank.phi, bank.older, bank.newer
+    y, v, d = bank.shift[0, i], bank.shift[1, i], bank.shift[2, i]
+    bank.shift[0, i] = phi[0, i] * y + phi[1, i] * v + (older[0, i] + newer[0, i]) * d
+    bank.shift[1, i] = phi[2, i] * y + phi[3, i] * v + (older[1, i] + newer[1, i]) * d
+
+
+@compiled
+def _end_shift(bank: Record, i: int) -> None:
+    for c in range(3):
+        bank.shift[c, i] = 0.0
 
 
 @compiled
@@ -606,10 +615,7 @@ def predict_bank(bank: Record, estimator: Record, force: float, age: float = 0.0
         state[0, i] = phi[0, i] * y + phi[1, i] * v + bank.older[0, i] * a + bank.newer[0, i] * b
         state[1, i] = phi[2, i] * y + phi[3, i] * v + bank.older[1, i] * a + bank.newer[1, i] * b
         if bank.untimely[i] > 0.0:
-            y, v, d = bank.shift[0, i], bank.shift[1, i], bank.shift[2, i]
-            by_d = bank.older[0, i] + bank.newer[0, i], bank.older[1, i] + bank.newer[1, i]
-            y_next = phi[0, i] * y + phi[1, i] * v + by_d[0] * d
-            _set_shift(bank, i, y_next, phi[2, i] * y + phi[3, i] * v + by_d[1] * d, d)
+            _advance_shift(bank, i)
 
 
 @compiled

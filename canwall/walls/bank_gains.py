@@ -141,8 +141,8 @@ def set_filters(
             damped = min(plant[1] / (plant[0] * _DAMPED), 1.0)
             calm = _CALM + (1.0 - _CALM) * damped
             slower = min(calm, _STEADY / lightest * felt_less**_STEADINESS)
-            # The bandwidth that little damping allows is the same on softer walls.
-            quickening *= slower < calm
+            if slower == calm:  # what little damping allows is the same on softer walls
+                quickening = 0.0
             lively = max(min(1.0, _LIVELY_N / count_force) ** _STEADINESS, slower)
             walk *= heavier * slower**3  # by the cube of the bandwidth
             felt_more = max(1.0 - felt_less, 0.0)
