@@ -106,7 +106,7 @@ BANK = np.dtype(
         ("far_share", "f8", (MAX_FILTERS,)),
         # Standard deviations: of the position at a sample, by a torque whose step of 1 N·m was not
         # when it should be; of [y, ẏ, d] by all steps up to now, of which the gain knows nothing;
-        # and the variance of a reading.
+        # and the variance of a reading, or of what no model has.
         ("untimely", "f8", (MAX_FILTERS,)),
         ("shift", "f8", (3, MAX_FILTERS)),
         ("reading", "f8"),
@@ -166,6 +166,9 @@ _LANDING_S, _PRESSED, _SLOW = 0.04, 4, 0.38
 _FOUND_SPREAD = 0.2
 #: Lightest mass that explains the motion of a hand that is known, over the one told.
 _KNOWN_LIGHTEST = 0.5
+#: Step of an encoder beyond which finer ones leave residuals as large [rad]: they are what no model
+#: of handle and servo has, and with less of them each step of the torque would be untimely.
+_FINEST = 4.7e-5
 #: Least doubt while a handle moves, of a hand for which doubt about the delay counts: its filters,
 #: quick meanwhile, take steps of the encoder for a push, which throws it out of the wall.
 _DOUBT_IN_MOTION = 0.8
@@ -224,7 +227,7 @@ def set_bank(
     set_regression(bank["regression"][0, 0], lightest, period, count, told, shaft)
     slower = 1 if shaft is None else OBSERVER_SLOWER_BEHIND_SHAFT
     set_probe(bank["probe"][0, 0], lightest, period, count, slower)
-    bank["stiffest"], bank["reading"] = np.inf, count**2 / 12.0
+    bank["stiffest"], bank["reading"] = np.inf, max(count, _FINEST) ** 2 / 12.0
     bank["within"] = bank["far_share"] = bank["untimely"] = 0.0
     bank["gain_in_flight"] = bank["trend_gain"] = 0.0
     bank["steadiest"] = STEADIEST * masses[-1] / period**2

@@ -558,6 +558,24 @@ def test_steps_of_the_torque_may_be_untimely(i: int) -> None:
         np.testing.assert_allclose(bank["shift"][0, :, i] / scale, deviation / scale, atol=1e-4)
 
 
+def test_finer_encoder_leaves_no_smaller_residuals_after_a_blow() -> None:
+    bank, estimator = np.zeros(1, BANK), np.zeros(1, ESTIMATOR)
+    fine, i, step = 2.0 * np.pi / 2**20, 8, 0.4
+    set_bank(bank, MASSES, VISCOUS, 0.0, PERIOD, fine, WALK, DELAY)
+    set_estimator(estimator, MASSES[0], VISCOUS[0], 0.0, 0.0, PERIOD, fine, WALK, DELAY)
+    reset_estimator(estimator, 0.0)
+    reset_bank(bank, 0.0)
+    set_pace(bank[0], 1e9)
+    bank["within"], bank["far"] = 0.0, np.inf
+    gain = bank["gain"][0, :, i].copy()
+    shift = 0.06 * step * PERIOD**2 / MASSES[i] * np.array([1.0, 1.0 / PERIOD, 0.0])
+    variance = 4.7e-5**2 / 12.0 / (1.0 - gain[0])
+    expected = (variance * gain + shift[0] * shift) / (variance + shift[0] ** 2)
+    estimator["in_flight"][0, estimator["delay_periods"]] = step
+    correct_bank(bank[0], estimator[0], fine)
+    np.testing.assert_allclose(bank["state"][0, :, i], fine * expected, rtol=1e-9)
+
+
 def corrected(prior: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the covariance after a sample."""
     gain = prior[:, 0] / (prior[0, 0] + COUNT**2 / 12.0)
