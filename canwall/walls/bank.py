@@ -104,12 +104,9 @@ BANK = np.dtype(
         ("far", "f8"),
         ("far_gain", "f8", (3, MAX_FILTERS)),
         ("far_share", "f8", (MAX_FILTERS,)),
-        # Standard deviations: of the position at a sample, by a torque whose step of 1 N·m was not
-        # when it should be; of [y, ẏ, d] by all steps up to now, of which the gain knows nothing;
-        # and the variance of a reading, or of what no model has.
+        # Square of the motion by a torque whose step of 1 N·m is not when it should be, up to the
+        # sample, over the variance of a reading.
         ("untimely", "f8", (MAX_FILTERS,)),
-        ("shift", "f8", (3, MAX_FILTERS)),
-        ("reading", "f8"),
         ("sampled", "f8"),
         ("equal", "i8"),  # samples in a row up to now
         # Over a period: Φ row by row, and the effects on (y, ẏ) of the older force, which acts up
@@ -166,12 +163,6 @@ _LANDING_S, _PRESSED, _SLOW = 0.04, 4, 0.38
 _FOUND_SPREAD = 0.2
 #: Lightest mass that explains the motion of a hand that is known, over the one told.
 _KNOWN_LIGHTEST = 0.5
-#: Step of an encoder beyond which finer ones leave residuals as large [rad]: they are what no model
-#: of handle and servo has, and with less of them each step of the torque would be untimely.
-_FINEST = 4.7e-5
-#: Least doubt while a handle moves, of a hand for which doubt about the delay counts: its filters,
-#: quick meanwhile, take steps of the encoder for a push, which throws it out of the wall.
-_DOUBT_IN_MOTION = 0.8
 #: Growth in a period of ln(mass) once it was known and no longer is, while the torque rises: a hand
 #: that lets go within milliseconds looks heavy, since the wall gives way and nothing moves, and the
 #: handle would be thrown.
@@ -227,7 +218,7 @@ def set_bank(
     set_regression(bank["regression"][0, 0], lightest, period, count, told, shaft)
     slower = 1 if shaft is None else OBSERVER_SLOWER_BEHIND_SHAFT
     set_probe(bank["probe"][0, 0], lightest, period, count, slower)
-    bank["stiffest"], bank["reading"] = np.inf, max(count, _FINEST) ** 2 / 12.0
+    bank["stiffest"] = np.inf
     bank["within"] = bank["far_share"] = bank["untimely"] = 0.0
     bank["gain_in_flight"] = bank["trend_gain"] = 0.0
     bank["steadiest"] = STEADIEST * masses[-1] / period**2
@@ -240,7 +231,7 @@ def set_bank(
 
 def reset_bank(bank: NDArray[np.void], y: float) -> None:
     """Begin at rest at y with the lightest hand."""
-    bank["state"] = bank["trend"] = bank["shift"] = 0.0
+    bank["state"] = bank["trend"] = 0.0
     bank["alone"], bank["flies"] = 0, False
     bank["landed"], bank["pressed"], bank["presses"] = bank["landing"], 0, False
     bank["state"][:, 0] = y
@@ -281,14 +272,15 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
         residual = y_sample - state[0, i]
         if bank.flies and bank.gain_in_flight[0, i] > 0.0:
             _correct_in_flight(bank, i, residual)
-            _end_shift(bank, i)
             continue
         far = residual - min(max(residual, -bank.far), bank.far)
         near = residual - far
         near -= min(max(near, -bank.within[i]), bank.within[i])
-        left = _correct_shift(bank, i, residual, step)
+        share = _untimely_share(bank, i, step)
         for c in range(3):
-            state[c, i] += left * (gain[c, i] * near + bank.far_gain[c, i] * far)
+            state[c, i] += (1.0 - share) * (gain[c, i] * near + bank.far_gain[c, i] * far)
+        state[0, i] += share * residual
+        state[1, i] += share * residual / bank.regression[0].period
         if follows:
             _follow_trend(bank, i, bank.trend_gain[i] * gain[2, i] * (near + far))
     _bound_velocity(bank, y_sample)
@@ -309,7 +301,6 @@ def follow_estimator(bank: Record, estimator: Record) -> None:
     for i in range(bank.count):
         bank.state[0, i], bank.state[1, i] = estimator.y, estimator.v
         bank.state[2, i], bank.trend[i] = estimator.d, 0.0
-        _end_shift(bank, i)
 
 
 @compiled
@@ -336,46 +327,16 @@ def _torque_step(bank: Record, estimator: Record) -> float:
 
 
 @compiled
-def _correct_shift(bank: Record, i: int, residual: float, step: float) -> float:
-    """Correct filter i by what steps of the torque may have done; return what is left for its gain.
+def _untimely_share(bank: Record, i: int, step: float) -> float:
+    """Return the share of what filter i does not expect that a step of the torque has made.
 
-    A step that came at another time than expected was an impulse more or less. It moves [y, ẏ, d]
-    along (T, 1, 0), and the filter from there as its gain g has it: by s, with s ← Φ(s − g·s₁), one
-    standard deviation. So the covariance is that of the steady state, which belongs to g, plus
-    s·sᵀ, and the gain for residuals of the variance S + s₁² is (S·g + s₁·s)/(S + s₁²). A sample
-    leaves of s·sᵀ the part w = S/(S + s₁²): exactly as in Friedland, IEEE Trans. Autom. Control 14,
-    1969, where the time is an unknown constant. What a blow does to position and velocity is thus
-    not taken for a push, neither at once nor by what is wrong about the velocity afterwards.
+    The step may have come at another time than expected, and was an impulse more or less: noise
+    along (T, 1, 0) in [y, ẏ, d], of variance b² at the sample. It makes of the gain g of a filter
+    whose residual has the variance S the gain (1 − w)·g + w·(1, 1/T, 0), with w = b²/(b² + S). What
+    a blow does to position and velocity is thus not taken for a push.
     """
-    if bank.untimely[i] == 0.0:
-        return 1.0
-    state, gain, shift = bank.state, bank.gain, bank.shift
-    amount = bank.untimely[i] * step
-    shift[0, i] += amount
-    shift[1, i] += amount / bank.regression[0].period
-    seen = shift[0, i]
-    variance = bank.reading / (1.0 - gain[0, i])
-    left = variance / (variance + seen * seen)
-    by_shift = seen / (variance + seen * seen) * residual
-    root = math.sqrt(left)
-    for c in range(3):
-        state[c, i] += by_shift * shift[c, i]
-        shift[c, i] = root * (shift[c, i] - gain[c, i] * seen)
-    return left
-
-
-@compiled
-def _advance_shift(bank: Record, i: int) -> None:
-    phi, older, newer = bank.phi, bank.older, bank.newer
-    y, v, d = bank.shift[0, i], bank.shift[1, i], bank.shift[2, i]
-    bank.shift[0, i] = phi[0, i] * y + phi[1, i] * v + (older[0, i] + newer[0, i]) * d
-    bank.shift[1, i] = phi[2, i] * y + phi[3, i] * v + (older[1, i] + newer[1, i]) * d
-
-
-@compiled
-def _end_shift(bank: Record, i: int) -> None:
-    for c in range(3):
-        bank.shift[c, i] = 0.0
+    ratio = bank.untimely[i] * step * step * (1.0 - bank.gain[0, i])
+    return ratio / (1.0 + ratio)
 
 
 @compiled
@@ -549,10 +510,9 @@ def spread_in_force(bank: Record) -> float:
 
 @compiled
 def doubt(bank: Record) -> float:
-    """Return the doubt about the mass in force and, in motion, about delay and push, from 0 to 1.
+    """Return the doubt about the mass in force and, in motion, about the delay, from 0 to 1.
 
     That of the mass is the deviation of its logarithm, that of the delay its deviation in periods.
-    That of the push is the larger one with a hand that is being identified.
     On an elastic shaft there is none: more damping than its bound reckons with would drive the
     resonance.
     """
@@ -562,11 +522,10 @@ def doubt(bank: Record) -> float:
     of_mass = spread_in_force(bank)
     if of_mass == 0.0 and not bank.holds:
         return 1.0
-    in_motion = 0.0
+    of_delay = 0.0
     if is_lively(bank):
-        least = 0.0 if bank.holds else _DOUBT_IN_MOTION
-        in_motion = _in_force(bank, bank.delay_counts) * max(regression.excess_spread, least)
-    return min(of_mass + in_motion, 1.0)
+        of_delay = _in_force(bank, bank.delay_counts) * regression.excess_spread
+    return min(of_mass + of_delay, 1.0)
 
 
 @compiled
@@ -617,8 +576,6 @@ def predict_bank(bank: Record, estimator: Record, force: float, age: float = 0.0
         a, b = older + d, newer + d
         state[0, i] = phi[0, i] * y + phi[1, i] * v + bank.older[0, i] * a + bank.newer[0, i] * b
         state[1, i] = phi[2, i] * y + phi[3, i] * v + bank.older[1, i] * a + bank.newer[1, i] * b
-        if bank.untimely[i] > 0.0:
-            _advance_shift(bank, i)
 
 
 @compiled

@@ -61,7 +61,7 @@ _FAR, _FAR_SHARE = 1.5, 0.38
 #: Uncertainty of a torque's course, as a share of its steps, for filters of masses from the latter
 #: multiple of the lightest one on; none up to the former. The push of a light hand changes as fast
 #: as a wall does, and its filter needs all that a sample says of it.
-_UNTIMELY, _UNTIMELY_FROM = 0.06, (1.4, 2.2)
+_UNTIMELY, _UNTIMELY_FROM = 0.04, (1.4, 2.2)
 #: Time constants of a filter for which samples have to be equal before its velocity is bounded by
 #: them. (Bounded by anything but the covariance that belongs to its gain, a filter of a handle at
 #: rest diverges.)
@@ -134,23 +134,21 @@ def set_filters(
     for i in range(len(masses)):
         plant = float(masses[i]), bank["viscous"][i].item(), spring, period
         walk, heavier, slower, lively = force_walk, float(masses[i] / masses[0]), 1.0, 1.0
-        quickening = _QUICKENING
         count_force = plant[0] * count / (period**2 * radius)
         felt_less = _COUNT_FORCE_N / count_force
         if rigid:
             damped = min(plant[1] / (plant[0] * _DAMPED), 1.0)
             calm = _CALM + (1.0 - _CALM) * damped
             slower = min(calm, _STEADY / lightest * felt_less**_STEADINESS)
-            if slower == calm:  # what little damping allows is the same on softer walls
-                quickening = 0.0
             lively = max(min(1.0, _LIVELY_N / count_force) ** _STEADINESS, slower)
             walk *= heavier * slower**3  # by the cube of the bandwidth
             felt_more = max(1.0 - felt_less, 0.0)
             bank["within"][i] = 0.5 * _WITHIN * felt_more * count
             bank["far_share"][i] = _FAR_SHARE * felt_more
-            bank["untimely"][i] = _untimely(heavier) * period**2 / plant[0]
+            impulse = _untimely(heavier) * period / plant[0]
+            bank["untimely"][i] = 12.0 * (impulse * period / count) ** 2
         _set_filter(bank, i, kalman_model(*plant, count, walk))
-        _set_paces(bank, i, plant, count, walk, lively / slower, quickening, rigid)
+        _set_paces(bank, i, plant, count, walk, lively / slower, rigid)
         _set_torques(bank, i, *plant)
         # Of a single one the lightest is not known: it is as light as the encoder lets it be quick.
         lightness = 1.0 / heavier if len(masses) > 1 else felt_less / _LIGHT
@@ -175,17 +173,16 @@ def _set_paces(
     count: float,
     walk: float,
     faster: float,
-    quickening: float,
     rigid: bool,
 ) -> None:
     """Write the gains of a filter and what rest tells it.
 
     Its bandwidth goes with that of the delay. faster: that for a handle that moves, over that for
-    the stiffest wall. quickening: power of the stiffness with which it rises on softer ones.
+    the stiffest wall.
     """
     period = plant[-1]
     paces = np.zeros((len(QUICKER), PACES + 1, 6))
-    shares = np.array(_shares(bank, i, faster, quickening))[:, None]
+    shares = np.array(_shares(bank, i, faster))[:, None]
     for k, quicker in enumerate(QUICKER if rigid else [1.0] * len(QUICKER)):
         steady = _gain_and_rest(kalman_model(*plant, count, walk * quicker**3), period)
         quick = _gain_and_rest(kalman_model(*plant, count, walk * (quicker * faster) ** 3), period)
@@ -193,16 +190,16 @@ def _set_paces(
     bank["paces"][:, :, :, i] = _parabolas(np.array(QUICKER), paces)
 
 
-def _shares(bank: np.void, i: int, faster: float, quickening: float) -> list[float]:
+def _shares(bank: np.void, i: int, faster: float) -> list[float]:
     """Return the share of the way from a filter's steadiest gains to its quickest, by pace.
 
-    faster: bandwidth of the quickest over that of the steadiest. quickening: as for `_set_paces`.
+    faster: bandwidth of the quickest over that of the steadiest.
     """
     if faster == 1.0:
         return [0.0] * (PACES + 1)
     steadiest = math.exp(bank["log_step"] * (i + 1 - bank["count"]))
     softer = [min(max(steadiest * 2.0**k, 1.0), _SOFTEST) for k in range(PACES)]
-    shares = [quickening * math.log(each) / math.log(faster) for each in softer]
+    shares = [_QUICKENING * math.log(each) / math.log(faster) for each in softer]
     return [*(min(share, 1.0) for share in shares), 1.0]
 
 

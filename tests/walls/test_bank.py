@@ -193,25 +193,19 @@ def test_known_hand_keeps_its_mass_and_tells_the_delay(mass: float, excess: floa
 
 
 @pytest.mark.parametrize(("mass", "share"), [(1e-4, 0.0), (10**-3.5, 0.5), (1e-3, 1.0), (3e-3, 1)])
-@pytest.mark.parametrize(("identified", "doubted"), [(True, 0.8), (False, 0.2)])
-def test_delay_and_push_in_doubt_count_for_a_heavy_hand_that_moves(
-    mass: float, share: float, identified: bool, doubted: float
-) -> None:
+def test_delay_in_doubt_counts_for_a_heavy_hand_that_moves(mass: float, share: float) -> None:
     bank, _ = bank_at(0.0)
-    bank["holds"] = not identified
     bank["place"] = np.interp(np.log(mass), np.log(MASSES), np.arange(len(MASSES)))
     bank["spread"], bank["regression"]["excess_spread"] = 0.1, 0.2
     assert doubt(bank[0]) == 0.1
     bank["moved"] = bank["lively"] - 1
-    assert doubt(bank[0]) == pytest.approx(0.1 + share * doubted, abs=8e-3)
+    assert doubt(bank[0]) == pytest.approx(0.1 + share * 0.2, abs=2e-3)
     # To the digit it is interpolated between two filters.
     counts = np.clip(np.log10(MASSES / MASSES[0]), 0.0, 1.0)
     counted = np.interp(bank["place"][0], np.arange(len(MASSES)), counts)
-    assert doubt(bank[0]) == pytest.approx(0.1 + counted * doubted)
-    bank["regression"]["excess_spread"] = 0.85
-    assert doubt(bank[0]) == pytest.approx(0.1 + counted * 0.85)
+    assert doubt(bank[0]) == pytest.approx(0.1 + counted * 0.2)
     bank["spread"] = 0.9
-    assert doubt(bank[0]) == pytest.approx(min(0.9 + counted * 0.85, 1.0))
+    assert doubt(bank[0]) == pytest.approx(min(0.9 + counted * 0.2, 1.0))
 
 
 def relative_bandwidths(
@@ -267,10 +261,7 @@ def test_state_is_that_of_the_matching_filter_alone(i: int) -> None:
 
 
 def test_filters_are_quicker_on_softer_walls() -> None:
-    """By K^(-1/6) below K·T²/m = 1, up to the lightest one's; gains as by their own Riccati.
-
-    Not the lightest itself, whose little damping allows no more on any wall.
-    """
+    """By K^(-1/6) below K·T²/m = 1, up to the lightest one's; gains as by their own Riccati."""
     bank, _ = bank_at(0.0)
     stiffest = MASSES[15] / PERIOD**2
     for softer, i in ((1.0, 15), (4.0, 15), (64.0, 15), (16.0, 9), (64.0, 2), (64.0, 0)):
@@ -278,7 +269,6 @@ def test_filters_are_quicker_on_softer_walls() -> None:
         of_its_own = softer * MASSES[i] / MASSES[15]
         slower, lively = relative_bandwidths(i)
         quicker = min(min(max(of_its_own, 1.0), 16.0) ** (1.0 / 6.0), lively / slower)
-        quicker = quicker if i > 0 else 1.0
         np.testing.assert_allclose(bank["gain"][0, :, i], gain_of(i, quicker), rtol=0.1)
 
 
@@ -517,69 +507,23 @@ def test_what_is_far_from_the_prediction_is_followed_more_quickly(i: int) -> Non
         np.testing.assert_allclose(bank["state"][0, :, i], corrected * COUNT, rtol=1e-9)
 
 
+@pytest.mark.parametrize("step", [0.0, 0.05, -0.4])
 @pytest.mark.parametrize("i", [0, 2, 6, 15])
-def test_steps_of_the_torque_may_be_untimely(i: int) -> None:
-    """A Kalman filter, by its covariance, whose force model has noise in the impulse of a step."""
+def test_step_of_the_torque_may_be_untimely(i: int, step: float) -> None:
+    """A Kalman filter whose force model has noise in the impulse of 0.04 of the step."""
     bank, estimator = bank_at(0.0)
     bank["within"], bank["far"] = 0.0, np.inf
-    mass, now = float(MASSES[i]), estimator["delay_periods"][0]
-    # Prior covariance of the steady state, in units of the states, and what it becomes.
+    estimator["in_flight"][0, estimator["delay_periods"][0]] = step
     scale = bank["scale"][0, i]
-    steady = bank["covariance"][0, i] * np.outer(scale, scale)
-    phi, force = discrete(mass, VISCOUS[i], PERIOD)
-    transition = np.block(
-        [[phi, np.array(force).reshape(2, 1)], [np.zeros((1, 2)), np.ones((1, 1))]]
-    )
-    noise = steady - transition @ corrected(steady) @ transition.T
+    prior = bank["covariance"][0, i] * np.outer(scale, scale)
     share = np.clip(np.log(MASSES[i] / MASSES[0] / 1.4) / np.log(2.2 / 1.4), 0.0, 1.0)
     assert (share > 0.0) == (i > 1)
-    prior, deviation = steady.copy(), np.zeros(3)
-    for step, residual in ((0.4, 3.0), (0.0, -1.0), (-0.3, 1.5), (0.0, 2.0), (0.0, -0.5)):
-        made = 0.06 * share * step * PERIOD / mass * np.array([PERIOD, 1.0, 0.0])
-        # Steps are untimely together: what they make is one deviation.
-        rest = prior - np.outer(deviation, deviation)
-        deviation = deviation + made
-        prior = rest + np.outer(deviation, deviation)
-        gain = prior[:, 0] / (prior[0, 0] + COUNT**2 / 12.0)
-        bank["state"] = 0.0
-        estimator["in_flight"][0, now : now + 2] = step, 0.0
-        correct_bank(bank[0], estimator[0], residual * COUNT)
-        np.testing.assert_allclose(bank["state"][0, :, i], residual * COUNT * gain, rtol=1e-5)
-        predict_bank(bank[0], estimator[0], 0.0)
-        prior = transition @ corrected(prior) @ transition.T + noise
-        excess = prior - steady
-        deviation = excess[:, 0] / math.sqrt(excess[0, 0]) if excess[0, 0] > 0.0 else np.zeros(3)
-        np.testing.assert_allclose(
-            excess / np.outer(scale, scale),
-            np.outer(deviation, deviation) / np.outer(scale, scale),
-            atol=1e-8,
-        )
-        deviation *= np.sign(deviation @ bank["shift"][0, :, i] / scale**2 + 1e-300)
-        np.testing.assert_allclose(bank["shift"][0, :, i] / scale, deviation / scale, atol=1e-4)
-
-
-def test_finer_encoder_leaves_no_smaller_residuals_after_a_blow() -> None:
-    bank, estimator = np.zeros(1, BANK), np.zeros(1, ESTIMATOR)
-    fine, i, step = 2.0 * np.pi / 2**20, 8, 0.4
-    set_bank(bank, MASSES, VISCOUS, 0.0, PERIOD, fine, WALK, DELAY)
-    set_estimator(estimator, MASSES[0], VISCOUS[0], 0.0, 0.0, PERIOD, fine, WALK, DELAY)
-    reset_estimator(estimator, 0.0)
-    reset_bank(bank, 0.0)
-    set_pace(bank[0], 1e9)
-    bank["within"], bank["far"] = 0.0, np.inf
-    gain = bank["gain"][0, :, i].copy()
-    shift = 0.06 * step * PERIOD**2 / MASSES[i] * np.array([1.0, 1.0 / PERIOD, 0.0])
-    variance = 4.7e-5**2 / 12.0 / (1.0 - gain[0])
-    expected = (variance * gain + shift[0] * shift) / (variance + shift[0] ** 2)
-    estimator["in_flight"][0, estimator["delay_periods"]] = step
-    correct_bank(bank[0], estimator[0], fine)
-    np.testing.assert_allclose(bank["state"][0, :, i], fine * expected, rtol=1e-9)
-
-
-def corrected(prior: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the covariance after a sample."""
+    impulse = 0.04 * share * step * PERIOD / MASSES[i]
+    made = impulse * np.array([PERIOD, 1.0, 0.0])
+    prior += np.outer(made, made)
     gain = prior[:, 0] / (prior[0, 0] + COUNT**2 / 12.0)
-    return prior - np.outer(gain, prior[0])
+    correct_bank(bank[0], estimator[0], 2.0 * COUNT)
+    np.testing.assert_allclose(bank["state"][0, :, i], 2.0 * COUNT * gain, rtol=1e-6)
 
 
 def test_step_of_a_probe_is_in_time() -> None:
