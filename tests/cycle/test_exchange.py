@@ -168,7 +168,7 @@ def fake_time(**functions: object) -> SimpleNamespace:
 
 # Real time: the SYNCs' instants, by a clock of the test's own; compiled code has the machine's
 
-over_python_can = pytest.mark.parametrize("make_rig", ["python-can"], indirect=True)
+over_python_can = pytest.mark.parametrize("native", ["python-can"], indirect=True)
 
 
 class Clock:

@@ -496,7 +496,7 @@ def test_energy_put_out_in_one_contact_ends_the_run(make_rig: RigFactory) -> Non
 # A bus that fails
 
 
-over_python_can = pytest.mark.parametrize("make_rig", ["python-can"], indirect=True)
+over_python_can = pytest.mark.parametrize("native", ["python-can"], indirect=True)
 
 
 class FailingBus(VirtualBus):

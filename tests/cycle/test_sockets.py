@@ -21,7 +21,7 @@ from canwall.stopping import stop_on_signals
 
 PRESSING = 500
 
-pytestmark = pytest.mark.parametrize("make_rig", ["native"], indirect=True)
+pytestmark = pytest.mark.parametrize("native", ["native"], indirect=True)
 
 
 def pressing() -> Settings:
