@@ -102,7 +102,8 @@ def _strike(folder: Path, exchange: str) -> Strikes:
         configuration = bench.config(main_job.CHANGES)
         drive = bench.drive(configuration)
         candump = folder / "candump.log"
-        dump = bench.start("candump", "-L", "vcan0", output=candump)
+        # Simulated time goes faster than an emulated guest's candump gets to run.
+        dump = bench.start("candump", "-L", "-r", "4194304", "vcan0", output=candump)
         # As anything else on a bus: identifiers that are nobody's here, data at random.
         bench.start("cangen", "vcan0", "-g", "10", "-I", "7A0", "-L", "8", "-D", "r")
         bench.other_nodes()
