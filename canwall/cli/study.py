@@ -139,14 +139,14 @@ def comparison(
     if law and factor:
         raise InputError("--law and --factor: keep one of them")
     settings = settings_from(config_file)
-    from canwall.cycle import law_of, named_law, with_law
+    from canwall.config import absolute_law
+    from canwall.cycle import law_of, with_law
     from canwall.panel.at_the_terminal import compare_at_terminal
     from canwall.record import RunFolder
 
-    others = [with_law(settings, name) for name in law or []]
-    for other in others:
-        law_of(other.wall)
-    laws = tuple(map(named_law, others))
+    laws = tuple(absolute_law(name, Path()) for name in law or [])
+    for name in laws:
+        law_of(with_law(settings, name).wall)
     asked: dict[str, Any] = {"procedure": "comparison", "question": question, "repeats": repeats}
     asked |= {"seed": seed, "walls": [{"law": name} for name in laws]}
     asked |= {"factors": factor} if factor else {}
