@@ -92,8 +92,10 @@ _TOLD_FROM_REST = 0.072
 #: that withdraws still may be fast, but an arm on a wall with a finger's mass in its model swings,
 #: and at first more slowly than a hand may push.
 HAND_RATE, _CALM_HAND_RATE = 8.0, 1.0
-#: Mass over the one in force from which on a swing tells of another hand.
-_HEAVIER = 1.5
+#: Mass over the one in force from which on a swing tells of another hand, and rate of the torque
+#: from which on it goes to or fro [N·m/s]. Below it noise makes turns; the higher it is, the louder
+#: a swing is when it tells.
+_HEAVIER, _SWING_RATE = 1.5, 0.6
 #: Random walk of that change [N·m/s per √s]: within 10 ms a hand begins to push, and ends.
 _HAND_RATE_WALK = 20.0
 #: Torque that says something whatever friction does, as a multiple of that of a hand.
@@ -400,7 +402,7 @@ def _follow_swing(
     if not calm or estimator.in_flight[estimator.delay_periods] == 0.0:
         end_swing(swing)
         return
-    turns_at = _CALM_HAND_RATE / HAND_RATE * regression.hand_torque
+    turns_at = _SWING_RATE / HAND_RATE * regression.hand_torque
     if not follow_swing(swing, y_sample, r[0], _torque_surprise(regression), turns_at):
         return
     lightness, deviation, noise = lightness_of_swing(swing)

@@ -43,8 +43,9 @@ SWING = np.dtype(
 #: Duration of half a swing [s]: faster than a hand pushes to and fro, and no faster than what the
 #: torque tells of a blow.
 _SHORTEST_S, _LONGEST_S = 0.008, 0.042
-#: Way of a swing from end to end, and noise of what the observer does not expect [counts].
-_LEAST_WAY, _NOISE = 3.0, 0.5
+#: Way of a swing from end to end, less than the least number of counts that it may be, and noise of
+#: what the observer does not expect [counts].
+_LEAST_WAY, _NOISE = 1.5, 0.5
 #: Share of a half that may pass without a count: a handle that sticks and slips does not swing, and
 #: looks heavy while it sticks.
 _STUCK = 0.7
@@ -98,10 +99,13 @@ def follow_swing(swing: Record, y: float, position: float, torque: float, turns_
     swing.lowest, swing.highest = min(swing.lowest, y), max(swing.highest, y)
     if abs(torque) < turns_at or torque * swing.direction > 0.0:
         return False
-    swings = swing.direction != 0.0 and half.samples >= swing.shortest
+    swings = half.samples >= swing.shortest
     swings = swings and swing.highest - swing.lowest >= swing.least_way
     swings = swings and swing.stuck <= _STUCK * half.samples
     swing.halves = swing.halves + 1 if swings else 0
+    if swing.direction == 0.0:
+        # What goes in a direction from the first sample on may have done so for any time before.
+        swing.halves = -1 if half.samples == 1 else 0
     swing.direction = torque
     both = swing.both[0]
     both.rr, both.rt, both.tt = before.rr + half.rr, before.rt + half.rt, before.tt + half.tt
