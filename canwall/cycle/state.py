@@ -139,6 +139,7 @@ CYCLE = np.dtype(
         ("compares_lag", "?"),
         ("keeps_mass", "?"),
         ("lag_evidence", "f8"),
+        ("lag_noise", "f8"),  # mean square of what neither explains [rad²]
         ("lag", "i8"),
         # Requests of the loop.
         ("phase", "i8"),

@@ -43,6 +43,7 @@ from canwall.walls import (
     start_lagging,
     stiffest,
     take_over,
+    unexplained,
     wall_force,
     with_probe,
 )
@@ -55,8 +56,10 @@ _MEASURING = int(Phase.MEASURING)
 #: A bit for each of the cycles that count as recent.
 _RECENT = (1 << RECENT_CYCLES) - 1
 #: Logarithm of the likelihood ratio at which it is decided if TPDOs have begun to be a cycle late:
-#: at least three samples; and that of a hand whose mass was not known: both models are off then.
-_LAG_EVIDENCE, _LAG_EVIDENCE_OF_UNKNOWN = 30.0, 60.0
+#: at least two samples; and that of a hand whose mass was not known: both models are off then.
+_LAG_EVIDENCE, _LAG_EVIDENCE_OF_UNKNOWN = 15.0, 30.0
+#: Share of what neither explains that is exchanged with a sample.
+_LAG_NOISE_SHARE = 0.15
 #: Deviation of ln(mass) below which a mass that was not known then is, in spite of the doubt about
 #: the delay.
 _WELL_KNOWN_SPREAD = 0.05
@@ -324,7 +327,7 @@ def _may_begin_to_lag(cycle: Record) -> bool:
     cycle.lagging[0] = estimator
     cycle.compares_lag = True
     cycle.keeps_mass = knows_mass(cycle.bank[0])
-    cycle.lag_evidence = 0.0
+    cycle.lag_evidence = cycle.lag_noise = 0.0
     return True
 
 
@@ -350,7 +353,9 @@ def _compare_lag(cycle: Record) -> None:
     probed = is_probe_in_flight(probe)
     if not probed or other_torque_acts(probe, estimator.in_flight, estimator.delay_periods):
         # What a probe alone moves tells who is at the handle, whom neither model knows yet.
-        cycle.lag_evidence += likelier(lagging, losing, cycle.oriented)
+        square = unexplained(lagging, losing, cycle.oriented)
+        cycle.lag_noise += _LAG_NOISE_SHARE * (square - cycle.lag_noise)
+        cycle.lag_evidence += likelier(lagging, losing, cycle.oriented, cycle.lag_noise)
     decisive = _LAG_EVIDENCE if cycle.keeps_mass else _LAG_EVIDENCE_OF_UNKNOWN
     if cycle.lag_evidence > decisive:
         _go_on_lagging(cycle)

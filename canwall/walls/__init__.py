@@ -40,6 +40,7 @@ from canwall.walls.estimator import (
     stand_still,
     start_lagging,
     start_open_loop,
+    unexplained,
 )
 from canwall.walls.interface import (
     DEADBEAT,
@@ -129,6 +130,7 @@ __all__ = [
     "stiffest_wall",
     "stiffest_walls",
     "take_over",
+    "unexplained",
     "wall_force",
     "with_probe",
 ]

@@ -445,14 +445,22 @@ def end_lag(estimator: Record) -> None:
 
 
 @compiled
-def likelier(one: Record, other: Record, y_sample: float) -> float:
+def unexplained(one: Record, other: Record, y_sample: float) -> float:
+    """Return the smaller square of what two estimators do not expect of a sample [rad²]."""
+    return min((y_sample - one.y) ** 2, (y_sample - other.y) ** 2)
+
+
+@compiled
+def likelier(one: Record, other: Record, y_sample: float, noise: float) -> float:
     """Return by how much a sample is likelier for one estimator than for the other, bounded.
 
     It is the difference of their logarithmic likelihoods, with the larger variance of both: an
     estimator that has lost a sample is not the less likely for being less certain, which would
-    decide where the handle stands still. Call before `correct`.
+    decide where the handle stands still. Where neither explains the motion, as in a blow, the
+    variance is `noise` [rad²]: one that is far off, and right by chance, is not the likelier.
+    Call before `correct`.
     """
-    variance = max(_sample_variance(one), _sample_variance(other))
+    variance = max(_sample_variance(one), _sample_variance(other), noise)
     return _misfit(other, y_sample, variance) - _misfit(one, y_sample, variance)
 
 

@@ -220,6 +220,23 @@ def test_a_contact_tells_lost_from_late(operator: str, begin: int) -> None:
     assert simulate(settings, cycles, disturbances=lost).lag == 0
 
 
+@pytest.mark.parametrize("operator", ["finger", "grip"])
+def test_strikes_on_a_soft_wall_tell_lost_from_late(operator: str) -> None:
+    """Neither model explains a blow in an unknown hand: one that is right by chance is not."""
+    keys = {**OPERATORS[operator].keys, "wall.stiffness_nm_per_rad": 20.0}
+    settings = config.with_overrides(config.load(SIM_CONFIG), keys)
+    settings = settings.model_copy(update={"schedule": ()})
+    cycles = round(DURATION_S / 1e-3)
+    begins = range(250, 1450, 100)
+    told = 0
+    for begin in begins:
+        told += simulate(settings, cycles, disturbances=late_from(cycles, begin)).lag
+        lost = Disturbances.none(cycles)
+        lost.lost[begin] = True
+        assert simulate(settings, cycles, disturbances=lost).lag == 0, begin
+    assert told >= 10
+
+
 @pytest.mark.parametrize("begin", [247, 298, 332])
 def test_lost_tpdo_of_a_soft_wall_is_not_a_late_one(begin: int) -> None:
     """Who is at the handle is learned meanwhile: both models are off, and one far off by chance."""
