@@ -32,6 +32,7 @@ SWING = np.dtype(
         ("lowest", "f8"),
         ("highest", "f8"),
         ("direction", "f8"),  # in which the torque changes; 0: in none up to now
+        ("way", "f8"),  # of the handle in the half before, from end to end [rad]
         ("halves", "i8"),  # in a row that no hand makes
         ("last", "f8"),  # the last sample [rad]
         ("equal", "i8"),  # samples in a row up to now, and the most in the present half
@@ -49,6 +50,9 @@ _LEAST_WAY, _NOISE = 1.5, 0.5
 #: Share of a half that may pass without a count: a handle that sticks and slips does not swing, and
 #: looks heavy while it sticks.
 _STUCK = 0.7
+#: Most by which a half goes farther than the one before: in one that goes still farther a hand
+#: withdraws, which looks heavy as the wall follows it.
+_GROWTH = 4.0
 #: Halves in a row that are no hand's.
 _HALVES = 2
 
@@ -99,9 +103,12 @@ def follow_swing(swing: Record, y: float, position: float, torque: float, turns_
     swing.lowest, swing.highest = min(swing.lowest, y), max(swing.highest, y)
     if abs(torque) < turns_at or torque * swing.direction > 0.0:
         return False
-    swings = half.samples >= swing.shortest
-    swings = swings and swing.highest - swing.lowest >= swing.least_way
+    way = swing.highest - swing.lowest
+    swings = half.samples >= swing.shortest and way >= swing.least_way
     swings = swings and swing.stuck <= _STUCK * half.samples
+    if swing.halves > 0 and way > _GROWTH * swing.way:
+        swing.halves = 0
+    swing.way = way
     swing.halves = swing.halves + 1 if swings else 0
     if swing.direction == 0.0:
         # What goes in a direction from the first sample on may have done so for any time before.

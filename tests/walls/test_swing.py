@@ -81,6 +81,21 @@ def test_handle_that_sticks_and_slips_does_not_swing(slips: int, told: bool) -> 
     assert found == told
 
 
+@pytest.mark.parametrize(("growth", "told"), [(3.0, True), (5.0, False)])
+def test_half_in_which_a_hand_withdraws_is_none(growth: float, told: bool) -> None:
+    """It goes so many times as far as the one before, while the torque falls."""
+    swing = np.zeros(1, SWING)
+    set_swing(swing[0], PERIOD, COUNT)
+    end_swing(swing[0])
+    found = False
+    for j in range(50):
+        torque = 1e-7 * np.sin(np.pi * (j + 0.5) / 20)
+        counts = 4.0 * growth if j >= 20 else 4.0
+        y = COUNT * np.rint((j % 20) * counts / 19.0)
+        found |= follow_swing(swing[0], y, 0.0, torque, TURNS_AT)
+    assert found == told
+
+
 def test_pause_ends_a_swing() -> None:
     swing = np.zeros(1, SWING)
     set_swing(swing[0], PERIOD, COUNT)
