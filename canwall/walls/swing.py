@@ -44,8 +44,8 @@ SWING = np.dtype(
 #: Duration of half a swing [s]: faster than a hand pushes to and fro, and no faster than what the
 #: torque tells of a blow.
 _SHORTEST_S, _LONGEST_S = 0.008, 0.042
-#: Way of a swing from end to end, less than the least number of counts that it may be, and noise of
-#: what the observer does not expect [counts].
+#: Least way of a swing from end to end, between one count and two, and noise of what the observer
+#: does not expect [counts].
 _LEAST_WAY, _NOISE = 1.5, 0.5
 #: Share of a half that may pass without a count: a handle that sticks and slips does not swing, and
 #: looks heavy while it sticks.
@@ -106,13 +106,16 @@ def follow_swing(swing: Record, y: float, position: float, torque: float, turns_
     way = swing.highest - swing.lowest
     swings = half.samples >= swing.shortest and way >= swing.least_way
     swings = swings and swing.stuck <= _STUCK * half.samples
-    if swing.halves > 0 and way > _GROWTH * swing.way:
-        swing.halves = 0
-    swing.way = way
-    swing.halves = swing.halves + 1 if swings else 0
     if swing.direction == 0.0:
         # What goes in a direction from the first sample on may have done so for any time before.
         swing.halves = -1 if half.samples == 1 else 0
+    elif not swings:
+        swing.halves = 0
+    elif swing.halves > 0 and way > _GROWTH * swing.way:
+        swing.halves = 1
+    else:
+        swing.halves += 1
+    swing.way = way
     swing.direction = torque
     both = swing.both[0]
     both.rr, both.rt, both.tt = before.rr + half.rr, before.rt + half.rt, before.tt + half.tt

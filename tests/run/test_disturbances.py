@@ -142,9 +142,14 @@ def test_more_missing_than_allowed_say_so() -> None:
 # TPDOs that are late
 
 
-def late_from(cycles: int, begin: int, end: int | None = None) -> Disturbances:
+def lost_at(cycles: int, begin: int) -> Disturbances:
     disturbances = Disturbances.none(cycles)
     disturbances.lost[begin] = True
+    return disturbances
+
+
+def late_from(cycles: int, begin: int, end: int | None = None) -> Disturbances:
+    disturbances = lost_at(cycles, begin)
     disturbances.late[begin + 1 : end] = True
     return disturbances
 
@@ -183,9 +188,8 @@ def test_hand_is_found_in_spite_of_a_tpdo_that_is_lost_just_before_the_contact(b
     settings = strike_settings(settings, 1.0, 0.3, 0.02, 0.1, 0.15)
     cycles = 200
     rows = simulate(settings, cycles).rows
-    disturbances = Disturbances.none(cycles)
-    disturbances.lost[int(np.flatnonzero(rows["y"] < 0.0)[0]) - before] = True
-    lost = simulate(settings, cycles, disturbances=disturbances).rows
+    contact = int(np.flatnonzero(rows["y"] < 0.0)[0])
+    lost = simulate(settings, cycles, disturbances=lost_at(cycles, contact - before)).rows
     assert lost["y"].min() > 2.5 * rows["y"].min()
 
 
@@ -194,14 +198,19 @@ def test_an_adapting_model_tells_lost_from_late(begin: int) -> None:
     """While the hand presses, and the handle stands still: what decides is its way out."""
     given: dict[str, Any] = {"operator.adapt": True, "mechanics.inertia_kg_m2": 1e-4}
     settings, cycles = wall(1e-3, 50.0, **given)
-    lost = Disturbances.none(cycles)
-    lost.lost[begin] = True
-    run = simulate(settings, cycles, disturbances=lost)
+    run = simulate(settings, cycles, disturbances=lost_at(cycles, begin))
     assert run.lag == 0
     # The torque that goes on tells nothing of the mass.
     assert np.ptp(run.rows["mass_est"][begin - 10 : begin + 100]) == 0.0
     late = simulate(settings, cycles, disturbances=late_from(cycles, begin, cycles))
     assert (late.trip, late.lag) == (Trip.NONE, 1)
+
+
+def strikes_by(operator: str, **overrides: Any) -> tuple[Settings, int]:
+    """Four strikes by an operator on the wall of the configuration, and their cycles."""
+    keys = OPERATORS[operator].keys | overrides
+    settings = config.with_overrides(config.load(SIM_CONFIG), keys)
+    return settings.model_copy(update={"schedule": ()}), round(DURATION_S / 1e-3)
 
 
 @pytest.mark.parametrize(
@@ -211,29 +220,19 @@ def test_an_adapting_model_tells_lost_from_late(begin: int) -> None:
 )
 def test_a_contact_tells_lost_from_late(operator: str, begin: int) -> None:
     """Begun in a probe, in a contact or at rest in one, by a hand that is known or unknown."""
-    settings = config.with_overrides(config.load(SIM_CONFIG), OPERATORS[operator].keys)
-    settings = settings.model_copy(update={"schedule": ()})
-    cycles = round(DURATION_S / 1e-3)
+    settings, cycles = strikes_by(operator)
     assert simulate(settings, cycles, disturbances=late_from(cycles, begin)).lag == 1
-    lost = Disturbances.none(cycles)
-    lost.lost[begin] = True
-    assert simulate(settings, cycles, disturbances=lost).lag == 0
+    assert simulate(settings, cycles, disturbances=lost_at(cycles, begin)).lag == 0
 
 
 @pytest.mark.parametrize("operator", ["finger", "grip"])
 def test_strikes_on_a_soft_wall_tell_lost_from_late(operator: str) -> None:
     """Neither model explains a blow in an unknown hand: one that is right by chance is not."""
-    keys = {**OPERATORS[operator].keys, "wall.stiffness_nm_per_rad": 20.0}
-    settings = config.with_overrides(config.load(SIM_CONFIG), keys)
-    settings = settings.model_copy(update={"schedule": ()})
-    cycles = round(DURATION_S / 1e-3)
-    begins = range(250, 1450, 100)
+    settings, cycles = strikes_by(operator, **{"wall.stiffness_nm_per_rad": 20.0})
     told = 0
-    for begin in begins:
+    for begin in range(250, 1450, 100):
         told += simulate(settings, cycles, disturbances=late_from(cycles, begin)).lag
-        lost = Disturbances.none(cycles)
-        lost.lost[begin] = True
-        assert simulate(settings, cycles, disturbances=lost).lag == 0, begin
+        assert simulate(settings, cycles, disturbances=lost_at(cycles, begin)).lag == 0, begin
     assert told >= 10
 
 
@@ -242,9 +241,7 @@ def test_lost_tpdo_of_a_soft_wall_is_not_a_late_one(begin: int) -> None:
     """Who is at the handle is learned meanwhile: both models are off, and one far off by chance."""
     given: dict[str, Any] = {"operator.adapt": True, "mechanics.inertia_kg_m2": 1e-4}
     settings, cycles = wall(1e-3, 10.0, **given)
-    lost = Disturbances.none(cycles)
-    lost.lost[begin] = True
-    assert simulate(settings, cycles, disturbances=lost).lag == 0
+    assert simulate(settings, cycles, disturbances=lost_at(cycles, begin)).lag == 0
 
 
 def test_tpdo_that_is_late_once_does_not_disturb_the_estimate() -> None:

@@ -2,11 +2,19 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from canwall.walls.swing import SWING, end_swing, follow_swing, lightness_of_swing, set_swing
 
 PERIOD, COUNT = 1e-3, 4.8e-5
 TURNS_AT = 1e-8
+
+
+def new_swing() -> NDArray[np.void]:
+    swing = np.zeros(1, SWING)
+    set_swing(swing[0], PERIOD, COUNT)
+    end_swing(swing[0])
+    return swing
 
 
 def first_told(
@@ -16,9 +24,7 @@ def first_told(
 
     A torque that goes to and fro moves a mass; the handle goes by `counts` from end to end.
     """
-    swing = np.zeros(1, SWING)
-    set_swing(swing[0], PERIOD, COUNT)
-    end_swing(swing[0])
+    swing = new_swing()
     random = np.random.default_rng(1)
     for j in range(begin, cycles):
         phase = 2.0 * np.pi * hz * j * PERIOD
@@ -68,9 +74,7 @@ def test_what_is_no_swing_tells_nothing(hz: float, counts: float) -> None:
 @pytest.mark.parametrize(("slips", "told"), [(1, False), (2, False), (12, True)])
 def test_handle_that_sticks_and_slips_does_not_swing(slips: int, told: bool) -> None:
     """It goes four counts within that many of the 20 samples of a half."""
-    swing = np.zeros(1, SWING)
-    set_swing(swing[0], PERIOD, COUNT)
-    end_swing(swing[0])
+    swing = new_swing()
     found = False
     for j in range(200):
         torque = 1e-7 * np.sin(np.pi * (j + 0.5) / 20)
@@ -84,9 +88,7 @@ def test_handle_that_sticks_and_slips_does_not_swing(slips: int, told: bool) -> 
 @pytest.mark.parametrize(("growth", "told"), [(3.0, True), (5.0, False)])
 def test_half_in_which_a_hand_withdraws_is_none(growth: float, told: bool) -> None:
     """It goes so many times as far as the one before, while the torque falls."""
-    swing = np.zeros(1, SWING)
-    set_swing(swing[0], PERIOD, COUNT)
-    end_swing(swing[0])
+    swing = new_swing()
     found = False
     for j in range(50):
         torque = 1e-7 * np.sin(np.pi * (j + 0.5) / 20)
@@ -97,9 +99,7 @@ def test_half_in_which_a_hand_withdraws_is_none(growth: float, told: bool) -> No
 
 
 def test_pause_ends_a_swing() -> None:
-    swing = np.zeros(1, SWING)
-    set_swing(swing[0], PERIOD, COUNT)
-    end_swing(swing[0])
+    swing = new_swing()
     told = []
     for j in range(500):
         halves = int(j / 20)
