@@ -70,14 +70,24 @@ BENCHES: dict[str, dict[str, Sequence[float | str]]] = {
     "inertia configured 20 % too large": {"model_error": (0.2,)},
     "torque constant 10 % less": {"simulation.torque_constant_error": (-0.1,)},
     "torque constant 10 % more": {"simulation.torque_constant_error": (0.1,)},
+    "torque constant 20 % more": {"simulation.torque_constant_error": (0.2,)},
+    "inertia 20 % too large, `lightest_kg_m2` 0.8 of it": {
+        "model_error": (0.2,),
+        "operator.lightest_kg_m2": (0.96e-4,),
+    },
+    "torque constant 20 % more, `lightest_kg_m2` 0.8 of the inertia": {
+        "simulation.torque_constant_error": (0.2,),
+        "operator.lightest_kg_m2": (0.8e-4,),
+    },
     "stiction twice the Coulomb friction": {"breakaway": (2.0,)},
     "elastic shaft, 600 Hz": {"simulation.shaft_hz": (600.0,)},
     "elastic shaft, 400 Hz": {"simulation.shaft_hz": (400.0,)},
     "elastic shaft, 250 Hz": {"simulation.shaft_hz": (250.0,)},
 }
 _BENCH_DRAWS = 24
-#: First strikes: the wall [N·m/rad], the speeds of approach [rad/s], and the phases.
+#: First strikes: the wall [N·m/rad] and its caps, the speeds of approach [rad/s], and the phases.
 _FIRST_STIFFNESS = 200.0
+_FIRST_CAPS = (0.0, 0.8)
 _FIRST_SPEEDS = (0.3, 0.5, 0.7, 1.0)
 _FIRST_PHASES = tuple(round(n / 6.0, 3) for n in range(6))
 #: Resonances of the shafts [Hz].
@@ -404,11 +414,13 @@ def _write_benches(dataset: xr.Dataset) -> Iterator[str]:
 
 
 def _write_first_strikes(dataset: xr.Dataset) -> Iterator[str]:
-    """Yield depth and exit of the first strikes of each law."""
+    """Yield depth and exit of the first strikes of each law, for each cap."""
     yield from _head(_names(dataset, "operator"))
     for law in _names(dataset, "law"):
-        for name, cells in _first_strike(dataset.sel(law=law)):
-            yield _row(f"{law}: {name}", cells)
+        for cap in dataset["wall.cap"].values.tolist():
+            with_cap = f"cap {cap:g}" if cap else "no cap"
+            for name, cells in _first_strike(dataset.sel({"law": law, "wall.cap": cap})):
+                yield _row(f"{law}, {with_cap}: {name}", cells)
 
 
 def _first_strike(of_law: xr.Dataset) -> Iterator[tuple[str, list[str]]]:
@@ -477,9 +489,14 @@ LAW_TABLES = {
         "First strike of an unknown hand",
         (),
         _SERVOS_AND_FRICTIONS
-        | {"stiffness": (_FIRST_STIFFNESS,), "speed": _FIRST_SPEEDS, "phase": _FIRST_PHASES},
+        | {
+            "wall.cap": _FIRST_CAPS,
+            "stiffness": (_FIRST_STIFFNESS,),
+            "speed": _FIRST_SPEEDS,
+            "phase": _FIRST_PHASES,
+        },
         False,
-        False,
+        True,
         _write_first_strikes,
     ),
     "shaft": LawTable(
