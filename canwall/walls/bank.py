@@ -160,7 +160,7 @@ _FOLLOWED = 0.6
 _FLIGHT_S, _TREND_S = 0.04, 0.0028
 #: That time constant under the wall's torque [s] if the handle came with no more than this speed
 #: [rad/s]: its blow is small, and its push goes on growing.
-_TREND_PRESSED_S, _SLOW_COMING = 0.01, 2.0
+_TREND_PRESSED_S, _SLOW_COMING = 0.007, 2.8
 #: Time after a flight in which a hand begins to press [s], the sample under the wall's torque from
 #: which on it does, and the largest speed at which one tells how its push changes [rad/s]. Earlier
 #: and faster it is a blow, whose errors are those of delay and mass; later, with friction, the

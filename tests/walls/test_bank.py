@@ -782,25 +782,25 @@ def test_trend_is_no_faster_than_a_hand_and_is_forgotten_in_a_blow() -> None:
     assert bank["trend"][0, 0] == 8.0  # a handle that stops at once is all that the flight sees
     # The torque begins to act at the second sample.
     fly(bank, estimator, -30.0, 90)
-    trends = sticks(bank, estimator, np.full(4, 0.2), speed=-2.2)
+    trends = sticks(bank, estimator, np.full(4, 0.2), speed=-3.0)
     assert not bank["flies"][0]
     assert trends[3] / trends[1] == pytest.approx(math.exp(-2.0e-3 / 2.8e-3))
     # Out of the wall again it is no push that begins, either.
     fly(bank, estimator, -30.0, 90)
-    trends = sticks(bank, estimator, np.tile([0.2, 0.2, 0.0, 0.0], 6), speed=-2.2)
+    trends = sticks(bank, estimator, np.tile([0.2, 0.2, 0.0, 0.0], 6), speed=-3.0)
     assert abs(trends[-1]) < 0.01
 
 
 def test_trend_is_forgotten_more_slowly_if_the_handle_came_slowly() -> None:
     bank, estimator = bank_at(0.0)
     fly(bank, estimator, -0.02, 60)
-    trends = sticks(bank, estimator, np.array([0.2, 0.2, 0.2, 0.0, 0.0, 0.0]), speed=-1.8)
-    assert trends[3] / trends[1] == pytest.approx(math.exp(-2.0e-3 / 10e-3))
+    trends = sticks(bank, estimator, np.array([0.2, 0.2, 0.2, 0.0, 0.0, 0.0]), speed=-2.6)
+    assert trends[3] / trends[1] == pytest.approx(math.exp(-2.0e-3 / 7e-3))
     # Not when the wall has let go again.
     assert trends[5] / trends[4] == pytest.approx(math.exp(-1.0e-3 / 2.8e-3))
 
 
-@pytest.mark.parametrize(("speed", "forgotten_s"), [(-1.8, 0.01), (-2.2, 0.0028)])
+@pytest.mark.parametrize(("speed", "forgotten_s"), [(-2.6, 0.007), (-3.0, 0.0028)])
 def test_trend_of_a_hand_that_begins_to_press_is_followed_for_a_while(
     speed: float, forgotten_s: float
 ) -> None:
