@@ -2,8 +2,9 @@
 
 import os
 from collections.abc import Iterable, Mapping
+from operator import index
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsIndex
 
 from canwall.errors import ConfigError
 
@@ -12,7 +13,7 @@ def as_path(name: str, given: object, expected: str = "a path") -> Path:
     """Return a path. Raises ConfigError."""
     if isinstance(given, str | os.PathLike):
         return Path(given)
-    raise _wrong(name, expected, given)
+    raise wrong(name, expected, given)
 
 
 def as_dict(name: str, given: object) -> dict[str, Any]:
@@ -21,7 +22,23 @@ def as_dict(name: str, given: object) -> dict[str, Any]:
         return {}
     if isinstance(given, Mapping) and all(isinstance(key, str) for key in given):
         return dict(given)
-    raise _wrong(name, "a dictionary with names as keys", given)
+    raise wrong(name, "a dictionary with names as keys", given)
+
+
+def as_count(name: str, given: object, expected: str) -> int | None:
+    """Return a whole number, None for None. Raises ConfigError."""
+    if given is None:
+        return None
+    if isinstance(given, bool) or not isinstance(given, SupportsIndex):
+        raise wrong(name, expected, given)
+    return index(given)
+
+
+def as_text(name: str, given: object, expected: str) -> str | None:
+    """Return a text, None for None. Raises ConfigError."""
+    if given is None or isinstance(given, str):
+        return given
+    raise wrong(name, expected, given)
 
 
 def as_list(given: object) -> list[Any]:
@@ -29,5 +46,6 @@ def as_list(given: object) -> list[Any]:
     return list(given) if isinstance(given, Iterable) and not isinstance(given, str) else [given]
 
 
-def _wrong(name: str, expected: str, given: object) -> ConfigError:
+def wrong(name: str, expected: str, given: object) -> ConfigError:
+    """Return the error of an argument that is of another type than expected."""
     return ConfigError(f"{name}: has to be {expected}, not {type(given).__name__}")

@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from canwall.errors import InputError
-from canwall.library.arguments import as_dict, as_list, as_path
+from canwall.library.arguments import as_count, as_dict, as_list, as_path, as_text, wrong
 from canwall.library.configuration import Config, load
 from canwall.library.laws import LawLike, law_name
 from canwall.library.progress import Progress
@@ -84,18 +84,19 @@ def sweep(
         if given.get(name) is not None:
             raise InputError(f"sweep axis {name}: is given twice; keep one")
     given |= further
+    cores, scheduler = _workforce(workers, dask)
     plan = make_plan(
         settings, {name: _plain(v) for name, v in given.items() if v is not None}, through
     )
-    if through != "sim" or dask is not None:
+    if through != "sim" or scheduler is not None:
         _refuse_declared(value for axis in plan.conditions for value in axis.values)
     with Progress(progress) as display, TemporaryDirectory(prefix="canwall-") as folder:
         return run_sweep(
             plan,
             Path(folder, "sweep.nc") if output is None else as_path("output", output),
             resume,
-            workers,
-            dask,
+            cores,
+            scheduler,
             partial(display.count, "sweeping"),
         )
 
@@ -133,12 +134,13 @@ def law_table(
     """
     settings = load(config, overrides)
     laws = [law_name(one) for one in as_list(law)]
-    if through != "sim" or dask is not None:
+    cores, scheduler = _workforce(workers, dask)
+    if through != "sim" or scheduler is not None:
         _refuse_declared(laws)
     with Progress(progress) as display:
         count = partial(display.count, "striking walls")
         return compute_law_table(
-            name, settings, laws, as_list(operator), through, workers, dask, count
+            name, settings, laws, as_list(operator), through, cores, scheduler, count
         )
 
 
@@ -149,12 +151,20 @@ def sweep_figures(dataset: xr.Dataset) -> "dict[str, Figure]":
         The figures by name, "z-width", "energy" …, which notebooks display.
 
     Raises:
-        canwall.errors.InputError: If the sweep has a single stiffness.
+        canwall.errors.InputError: If the sweep has a single stiffness, or for anything else than a
+            Dataset.
     """
+    if not isinstance(dataset, xr.Dataset):
+        raise wrong("dataset", "the Dataset of a sweep (canwall.read has it from a file)", dataset)
     from canwall.library.figures import shown_in_notebooks
     from canwall.sweep.figures import draw_sweep
 
     return {name: shown_in_notebooks(figure) for name, figure in draw_sweep(dataset)}
+
+
+def _workforce(workers: object, dask: object) -> tuple[int | None, str | None]:
+    """Return the number of cores and the address of a scheduler. Raises ConfigError."""
+    return as_count("workers", workers, "a number of cores"), as_text("dask", dask, "an address")
 
 
 def _plain(values: object) -> object:
