@@ -84,19 +84,19 @@ def sweep(
         if given.get(name) is not None:
             raise InputError(f"sweep axis {name}: is given twice; keep one")
     given |= further
-    cores, scheduler = _workforce(workers, dask)
+    workers, dask = _workforce(workers, dask)
     plan = make_plan(
         settings, {name: _plain(v) for name, v in given.items() if v is not None}, through
     )
-    if through != "sim" or scheduler is not None:
+    if through != "sim" or dask is not None:
         _refuse_declared(value for axis in plan.conditions for value in axis.values)
     with Progress(progress) as display, TemporaryDirectory(prefix="canwall-") as folder:
         return run_sweep(
             plan,
             Path(folder, "sweep.nc") if output is None else as_path("output", output),
             resume,
-            cores,
-            scheduler,
+            workers,
+            dask,
             partial(display.count, "sweeping"),
         )
 
@@ -134,13 +134,13 @@ def law_table(
     """
     settings = load(config, overrides)
     laws = [law_name(one) for one in as_list(law)]
-    cores, scheduler = _workforce(workers, dask)
-    if through != "sim" or scheduler is not None:
+    workers, dask = _workforce(workers, dask)
+    if through != "sim" or dask is not None:
         _refuse_declared(laws)
     with Progress(progress) as display:
         count = partial(display.count, "striking walls")
         return compute_law_table(
-            name, settings, laws, as_list(operator), through, cores, scheduler, count
+            name, settings, laws, as_list(operator), through, workers, dask, count
         )
 
 

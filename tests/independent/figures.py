@@ -33,7 +33,7 @@ _DRIVE = {
     "mechanics.coulomb_nm": 0.0,
 }
 #: Time after a change of grip from which on a force that is not quiet is late [s].
-LATE_S = 0.15
+_LATE_S = 0.15
 _DAMPINGS = (0.05, 0.1, 0.2, 0.4)  # BT/m
 
 
@@ -172,7 +172,7 @@ def main() -> None:
             f"loud for {1e3 * loud_s:.0f} ms, burst {burst:.1f} N"
         )
         each = [after_change(bench, hand, later, [strike]) for strike in drawn]
-        late = sum(after_s > LATE_S for after_s, _, _ in each)
+        late = sum(after_s > _LATE_S for after_s, _, _ in each)
         quiet_s, loud_s, burst = np.max(each, axis=0)
         print(
             f"  of {len(drawn)} other strikes {late} late: quiet after {1e3 * quiet_s:.0f} ms, "
