@@ -64,18 +64,25 @@ BANK = np.dtype(
         ("gain", "f8", (3, MAX_FILTERS)),
         # How fast d changes [N·m/s], as filters of light hands find it in flight and while the hand
         # begins to press; their gain in flight and, over that of d, in contact [1/s], zero: those
-        # of heavier ones; what is left of it after any other period.
+        # of heavier ones; what is left of it after a period under the torque of a stiff wall if the
+        # handle came slowly, and after any other period.
         ("trend", "f8", (MAX_FILTERS,)),
         ("gain_in_flight", "f8", (4, MAX_FILTERS)),
         ("trend_gain", "f8", (MAX_FILTERS,)),
+        ("trend_left_pressed", "f8"),
         ("trend_left", "f8"),
+        # Stiffness of the softest wall that counts as stiff, and True if the one in force does.
+        ("stiff_from", "f8"),
+        ("stiff", "?"),
         # Samples since the wall gave a torque, the number from which on that is a flight, and True
         # in the flight of a handle that moves.
         ("alone", "i8"),
         ("flight", "i8"),
         ("flies", "?"),
-        # Samples since the last flight and those in a row under the wall's torque, the most of the
-        # former for a hand that begins to press, and True while it does.
+        # True if the handle came slowly from its last flight. Samples since then and those in a row
+        # under the wall's torque, the most of the former for a hand that begins to press, and True
+        # while it does.
+        ("came_slowly", "?"),
         ("landed", "i8"),
         ("pressed", "i8"),
         ("landing", "i8"),
@@ -154,6 +161,11 @@ _FOLLOWED = 0.6
 #: which the trend of the push is forgotten in contact [s]: what a blow and the push after it do to
 #: an estimate is no trend.
 _FLIGHT_S, _TREND_S = 0.04, 0.0028
+#: That time constant under the wall's torque [s] if the handle came with no more than this speed
+#: [rad/s], since its blow is small and its push goes on growing, and if K·T²/m of the lightest hand
+#: is no less than this: a softer wall is as deep as it should be anyway, and a trend that is kept
+#: makes its handle swing.
+_TREND_PRESSED_S, _SLOW_COMING, _STIFF = 0.007, 2.8, 0.6
 #: Time after a flight in which a hand begins to press [s], the sample under the wall's torque from
 #: which on it does, and the largest speed at which one tells how its push changes [rad/s]. Earlier
 #: and faster it is a blow, whose errors are those of delay and mass; later, with friction, the
@@ -208,7 +220,10 @@ def set_bank(
     bank["spring"] = spring
     bank["forgotten"] = round(_FORGOTTEN_S / period)
     bank["lively"], bank["calm"] = round(LIVELY_S / period), round(CALM_S / period)
-    bank["flight"], bank["trend_left"] = round(_FLIGHT_S / period), math.exp(-period / _TREND_S)
+    bank["flight"] = round(_FLIGHT_S / period)
+    bank["trend_left_pressed"] = math.exp(-period / _TREND_PRESSED_S)
+    bank["trend_left"] = math.exp(-period / _TREND_S)
+    bank["stiff_from"] = _STIFF * masses[0] / period**2
     bank["landing"] = round(_LANDING_S / period)
     told = delay - margin
     bank["delay"], bank["told"] = delay, told
@@ -232,7 +247,7 @@ def set_bank(
 def reset_bank(bank: NDArray[np.void], y: float) -> None:
     """Begin at rest at y with the lightest hand."""
     bank["state"] = bank["trend"] = 0.0
-    bank["alone"], bank["flies"] = 0, False
+    bank["alone"], bank["flies"], bank["came_slowly"], bank["stiff"] = 0, False, False, False
     bank["landed"], bank["pressed"], bank["presses"] = bank["landing"], 0, False
     bank["state"][:, 0] = y
     reset_regression(bank["regression"][0, 0], y)
@@ -264,7 +279,7 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
         begin_regression(bank.regression[0], y_sample, estimator.v, torque)
         bank.probe[0].samples = 0
         return False
-    _note_flight(bank, estimator)
+    _note_flight(bank, estimator, y_sample)
     slow = _SLOW * bank.regression[0].period + bank.regression[0].resolution
     follows = bank.presses and abs(y_sample - bank.sampled) <= slow
     step = _torque_step(bank, estimator)
@@ -304,7 +319,7 @@ def follow_estimator(bank: Record, estimator: Record) -> None:
 
 
 @compiled
-def _note_flight(bank: Record, estimator: Record) -> None:
+def _note_flight(bank: Record, estimator: Record, y_sample: float) -> None:
     """Note if the handle flies, or is pressed against the wall shortly after a flight.
 
     A flight is its way far from any contact, under no torque but a probe's.
@@ -313,9 +328,21 @@ def _note_flight(bank: Record, estimator: Record) -> None:
     bank.alone = 0 if other_torque_acts(probe, estimator.in_flight, now) else bank.alone + 1
     bank.flies = bank.alone > bank.flight and moves(bank.regression[0])
     bank.landed = 0 if bank.flies else bank.landed + 1
+    if bank.landed <= 1:  # the first sample of the contact is still the flight's
+        way = abs(y_sample - bank.sampled)
+        bank.came_slowly = way <= _SLOW_COMING * bank.regression[0].period
     wall_acts = estimator.in_flight[now] != probe.in_flight[now]
     bank.pressed = bank.pressed + 1 if wall_acts else 0
     bank.presses = bank.landed <= bank.landing and bank.pressed >= _PRESSED
+
+
+@compiled
+def _trend_left(bank: Record) -> float:
+    """Return the share of the trend that is left after a period."""
+    if bank.flies or bank.presses:
+        return 1.0
+    goes_on = bank.stiff and bank.pressed > 0 and bank.came_slowly
+    return bank.trend_left_pressed if goes_on else bank.trend_left
 
 
 @compiled
@@ -567,7 +594,7 @@ def predict_bank(bank: Record, estimator: Record, force: float, age: float = 0.0
     predict_regression(bank.regression[0], estimator.in_flight, force, age)
     send_probe(bank.probe[0], force)
     state, phi = bank.state, bank.phi
-    left = 1.0 if bank.flies or bank.presses else bank.trend_left
+    left = _trend_left(bank)
     for i in range(bank.count):
         change = bank.regression[0].period * bank.trend[i]
         y, v, d = state[0, i], state[1, i], state[2, i] + 0.5 * change

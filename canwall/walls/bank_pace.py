@@ -25,6 +25,7 @@ _WORTH = 0.015
 def set_pace(bank: Record, stiffness: float) -> None:
     """Make the filters as quick as handle and stiffness want; call before `correct_bank`."""
     regression = bank.regression[0]
+    bank.stiff = stiffness >= bank.stiff_from
     if abs(regression.way) >= _MOVES * regression.period:
         bank.moved = 0
     else:

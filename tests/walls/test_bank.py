@@ -751,13 +751,19 @@ def test_filter_of_a_light_hand_in_flight_is_not_behind_a_push_that_grows() -> N
 
 
 def sticks(
-    bank: NDArray[np.void], estimator: NDArray[np.void], torques: NDArray[np.float64]
+    bank: NDArray[np.void],
+    estimator: NDArray[np.void],
+    torques: NDArray[np.float64],
+    speed: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Let a handle stick under these torques, between two counts; return the ḋ of the lightest."""
-    stuck = float(bank["sampled"][0])
+    """Let a handle stick under these torques, between two counts; return the ḋ of the lightest.
+
+    It goes on with this speed [rad/s] for the first two samples, until a torque has begun to act.
+    """
+    came = float(bank["sampled"][0])
     trends = []
     for j, torque in enumerate(torques):
-        y = stuck + (j % 2) * COUNT
+        y = came + min(j + 1, 2) * speed * PERIOD + (j % 2) * COUNT
         predict_bank(bank[0], estimator[0], torque)
         predict(estimator[0], torque)
         correct(estimator[0], y)
@@ -772,27 +778,46 @@ def test_trend_is_no_faster_than_a_hand_and_is_forgotten_in_a_blow() -> None:
     assert bank["trend"][0, 0] == -8.0
     heavier = MASSES / MASSES[0] > 3.0
     assert np.all(bank["trend"][0, :16][heavier] == 0.0)
+    sticks(bank, estimator, np.full(1, 0.2))
+    assert bank["trend"][0, 0] == 8.0  # a handle that stops at once is all that the flight sees
     # The torque begins to act at the second sample.
-    trends = sticks(bank, estimator, np.full(4, 0.2))
+    fly(bank, estimator, -30.0, 90)
+    trends = sticks(bank, estimator, np.full(4, 0.2), speed=-3.0)
     assert not bank["flies"][0]
-    assert trends[0] == 8.0  # a handle that stops at once is all that the flight sees
-    assert trends[3] == pytest.approx(8.0 * math.exp(-2.0e-3 / 2.8e-3))
+    assert trends[3] / trends[1] == pytest.approx(math.exp(-2.0e-3 / 2.8e-3))
     # Out of the wall again it is no push that begins, either.
     fly(bank, estimator, -30.0, 90)
-    trends = sticks(bank, estimator, np.tile([0.2, 0.2, 0.0, 0.0], 6))
+    trends = sticks(bank, estimator, np.tile([0.2, 0.2, 0.0, 0.0], 6), speed=-3.0)
     assert abs(trends[-1]) < 0.01
 
 
-def test_trend_of_a_hand_that_begins_to_press_is_followed_for_a_while() -> None:
+@pytest.mark.parametrize(("stiffness", "forgotten_s"), [(0.61, 0.007), (0.59, 0.0028)])
+def test_trend_is_forgotten_more_slowly_at_a_stiff_wall_if_the_handle_came_slowly(
+    stiffness: float, forgotten_s: float
+) -> None:
+    bank, estimator = bank_at(0.0)
+    fly(bank, estimator, -0.02, 60)
+    set_pace(bank[0], stiffness * MASSES[0] / PERIOD**2)
+    trends = sticks(bank, estimator, np.array([0.2, 0.2, 0.2, 0.0, 0.0, 0.0]), speed=-2.6)
+    assert trends[3] / trends[1] == pytest.approx(math.exp(-2.0e-3 / forgotten_s))
+    # When the wall has let go again, it is as fast as ever.
+    assert trends[5] / trends[4] == pytest.approx(math.exp(-1.0e-3 / 2.8e-3))
+
+
+@pytest.mark.parametrize(("speed", "forgotten_s"), [(-2.6, 0.007), (-3.0, 0.0028)])
+def test_trend_of_a_hand_that_begins_to_press_is_followed_for_a_while(
+    speed: float, forgotten_s: float
+) -> None:
     """On a handle that sticks d is minus the torque: 40 ms after the flight its lag is back."""
     rate = 4.0
     bank, estimator = bank_at(0.0)
     fly(bank, estimator, 0.0, 60)
     assert bank["flies"][0]
     torques = rate * PERIOD * np.arange(120.0)
-    trends = sticks(bank, estimator, torques)
+    trends = sticks(bank, estimator, torques, speed)
     assert np.all(np.abs(trends[30:40] + rate) < 0.25 * rate)
-    assert np.all(np.abs(trends[70:]) < 1e-3)
+    left = math.exp(-PERIOD / forgotten_s)
+    np.testing.assert_allclose(trends[70:] / trends[69:-1], left, rtol=1e-6)
     # No flight, no trend: friction and a filter that integrates twice would hunt each other.
     bank, estimator = bank_at(0.0)
     assert np.all(sticks(bank, estimator, torques) == 0.0)
