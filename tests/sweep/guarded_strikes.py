@@ -1,0 +1,131 @@
+"""Random strikes that are quiet, and what the guard says of them: `guarded_strikes.py [DRAWS]`.
+
+A quiet strike does not chatter, is felt with no more than 0.1 N while it comes to rest, and leaves
+its first contact no faster than it came. A later contact may still throw the handle: that is read
+from the true positions, of which the guard knows nothing.
+"""
+
+import math
+import sys
+from collections.abc import Iterator
+from multiprocessing import Pool
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canwall.config import load
+from canwall.record import ROW
+from canwall.run.closed_loop import SIGNALS, ClosedLoop, simulate_wall
+from canwall.sweep import make_plan
+from canwall.sweep.law_tables import DAMPED
+from canwall.sweep.strike import OPERATORS, SERVOS
+from canwall.walls import LAWS
+
+CONFIGURATION = load(Path(__file__).parents[2] / "config" / "sim.toml")
+#: No law for a bench; the walls of the others, the speeds [rad/s] and the dampings B·T/m.
+_LAWS = [name for name in LAWS if name != "rigid"]
+_STIFFNESSES, _SPEEDS = (30.0, 5000.0), (0.2, 2.0)
+_DAMPINGS = (0.05, 0.1, 0.2, 0.3, 0.4)
+#: Those that ask for no model are soft [N·m/rad], and up to this share of m/T² more.
+_SAMPLED_SOFTEST, _SAMPLED_SHARE = 5.0, 0.15
+_WALLS = 12
+#: Felt while it comes to rest [N].
+_FELT_N = 0.1
+#: Cycles from the end of a contact in which the guard tells of it, and what it may leave with.
+_TOLD_WITHIN, _FASTER = 12, 1.1
+
+
+class Quiet(NamedTuple):
+    """A quiet strike: its wall, True if the guard told of it, and if a contact had thrown it."""
+
+    wall: str
+    told: bool
+    thrown: bool
+
+
+def quiet_strikes(draw: int) -> Iterator[Quiet]:
+    """Yield the quiet ones of the strikes of an operator with a law on walls of any stiffness."""
+    rng = np.random.default_rng(draw)
+    law, operator, servo = (str(rng.choice(list(names))) for names in (_LAWS, OPERATORS, SERVOS))
+    axes: dict[str, Any] = {
+        "law": law,
+        "operator": operator,
+        "servo": servo,
+        "friction": float(rng.choice([0.0, 0.01, 0.02])),
+        "speed": _log_uniform(rng, *_SPEEDS),
+        "phase": float(rng.random()),
+        "press": 1.2,
+        "model": "drive",
+        "stiffness": 100.0,
+        "guard.action": "warn",
+    }
+    ratio = float(rng.choice(_DAMPINGS)) if law in DAMPED else 0.0
+    if not LAWS[law].sampled:
+        axes["delay_error"] = float(rng.choice([-0.3, 0.0, 0.15]))
+    plan = make_plan(CONFIGURATION.model_copy(update={"sweep": {}}), axes)
+    prepared = plan.prepare(plan.points[0], plan.strikes[0])
+    settings = plan.settings(plan.points[0], plan.strikes[0])
+    assert settings.run.duration_s is not None
+    cycles = round(settings.run.duration_s / prepared.period)
+    loop = ClosedLoop(settings, cycles).records()
+    most = prepared.mass / prepared.period**2
+    walls = _STIFFNESSES
+    if LAWS[law].sampled:
+        walls = _SAMPLED_SOFTEST, 2.0 * _SAMPLED_SOFTEST + _SAMPLED_SHARE * most
+    for _ in range(_WALLS):
+        stiffness, damping = _log_uniform(rng, *walls), ratio * prepared.mass / prepared.period
+        measures = prepared.on(stiffness, damping)
+        if measures["chatters"] or measures["trip"]:
+            continue
+        if measures["settling_ripple"] > _FELT_N or measures["restitution"] > 1.0:
+            continue
+        signals = np.empty((SIGNALS, cycles))
+        simulate_wall(loop, stiffness, damping, np.zeros(cycles, ROW), signals)
+        guard = loop.cycle["guard"].reshape(-1)[0]
+        told, at = bool(guard["alarms"]), int(guard["first_alarm"])
+        thrown = told and throws(signals[0, : at + 1])
+        yield Quiet(f"{stiffness:.4g} N·m/rad, B {damping:.3g}: {axes}", told, thrown)
+
+
+def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    return math.exp(rng.uniform(math.log(low), math.log(high)))
+
+
+def throws(positions: NDArray[np.float64]) -> bool:
+    """Return True if a contact near the end left faster than it came.
+
+    positions: those at the SYNCs [rad], below zero inside the wall.
+    """
+    inside = positions < 0.0
+    entered = np.flatnonzero(~inside[:-1] & inside[1:]) + 1
+    left = np.flatnonzero(inside[:-1] & ~inside[1:]) + 1
+    for end in left[left >= len(positions) - _TOLD_WITHIN]:
+        (begin,) = entered[entered < end][-1:]
+        came = positions[begin - 2] - positions[begin - 1]
+        if positions[end + 1] - positions[end] > _FASTER * came:
+            return True
+    return False
+
+
+def _counted(draw: int) -> tuple[int, list[Quiet]]:
+    strikes = list(quiet_strikes(draw))
+    return len(strikes), [strike for strike in strikes if strike.told]
+
+
+def main(draws: int) -> None:
+    """Print how many strikes are quiet, of how many the guard tells, and how many were thrown."""
+    quiet = told = thrown = 0
+    with Pool() as pool:
+        for count, alarms in pool.imap_unordered(_counted, range(draws), 8):
+            quiet, told = quiet + count, told + len(alarms)
+            thrown += sum(strike.thrown for strike in alarms)
+            for strike in alarms:
+                if not strike.thrown:
+                    print(f"not thrown: {strike.wall}", flush=True)
+    print(f"{quiet} quiet strikes; the guard told of {told}, of which {thrown} were thrown")
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 1000)
