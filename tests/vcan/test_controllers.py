@@ -84,8 +84,8 @@ def test_transmit_queue_that_is_full_for_a_moment(
     embedded: Record,
     bench: Bench,
 ) -> None:
-    """Each SYNC comes upon the RPDO before it, which leaves after 10 ms: it is waited for."""
-    tc("qdisc", "add", "dev", controllers[1], "root", "netem", "delay", "10ms", "limit", "1")
+    """Each SYNC comes upon the RPDO before it, which leaves after 30 ms: it is waited for."""
+    tc("qdisc", "add", "dev", controllers[1], "root", "netem", "delay", "30ms", "limit", "1")
     try:
         record = _strike(bench, controllers, 0.3)
         queue = subprocess.run(
