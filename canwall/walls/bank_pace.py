@@ -23,7 +23,10 @@ _WORTH = 0.015
 
 @compiled
 def set_pace(bank: Record, stiffness: float) -> None:
-    """Make the filters as quick as handle and stiffness want; call before `correct_bank`."""
+    """Make the filters as quick as handle and stiffness want, and note if the wall is stiff.
+
+    To be called before `correct_bank`.
+    """
     regression = bank.regression[0]
     bank.stiff = stiffness >= bank.stiff_from
     if abs(regression.way) >= _MOVES * regression.period:
