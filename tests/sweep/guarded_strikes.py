@@ -1,8 +1,8 @@
 """Random strikes that are quiet, and what the guard says of them: `guarded_strikes.py [DRAWS]`.
 
 A quiet strike does not chatter, is felt with no more than 0.1 N while it comes to rest, and leaves
-its first contact no faster than it came. A later contact may still throw the handle: that is read
-from the true positions, of which the guard knows nothing.
+its first contact no faster than it came. A later contact may still throw the handle, which is read
+from the true positions, of which the guard knows nothing; or the wall may have buzzed before.
 """
 
 import math
@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import butter, sosfilt
 
 from canwall.config import load
 from canwall.record import ROW
@@ -33,16 +34,20 @@ _SAMPLED_SOFTEST, _SAMPLED_SHARE = 5.0, 0.15
 _WALLS = 12
 #: Felt while it comes to rest [N].
 _FELT_N = 0.1
+#: Ripple that is felt [N r.m.s.], cycles over which it is measured, in which a blow is over, and
+#: radius of the handle [m].
+_RIPPLE_N, _RIPPLES_FOR, _RADIUS = 0.3, 50, 0.08
 #: Cycles from the end of a contact in which the guard tells of it, and what it may leave with.
 _TOLD_WITHIN, _FASTER = 12, 1.1
 
 
 class Quiet(NamedTuple):
-    """A quiet strike: its wall, True if the guard told of it, and if a contact had thrown it."""
+    """A quiet strike: its wall, True if the guard told of it, and what there was to tell of."""
 
     wall: str
     told: bool
     thrown: bool
+    buzzed: bool
 
 
 def quiet_strikes(draw: int) -> Iterator[Quiet]:
@@ -86,7 +91,8 @@ def quiet_strikes(draw: int) -> Iterator[Quiet]:
         guard = loop.cycle["guard"].reshape(-1)[0]
         told, at = bool(guard["alarms"]), int(guard["first_alarm"])
         thrown = told and throws(signals[0, : at + 1])
-        yield Quiet(f"{stiffness:.4g} N·m/rad, B {damping:.3g}: {axes}", told, thrown)
+        buzzed = told and buzzes(signals[1, : at + 1], prepared.period)
+        yield Quiet(f"{stiffness:.4g} N·m/rad, B {damping:.3g}: {axes}", told, thrown, buzzed)
 
 
 def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
@@ -109,22 +115,29 @@ def throws(positions: NDArray[np.float64]) -> bool:
     return False
 
 
+def buzzes(forces: NDArray[np.float64], period: float) -> bool:
+    """Return True if the forces [N·m] have rippled above 20 Hz up to the end."""
+    ripple = sosfilt(butter(2, 20.0, "highpass", fs=1.0 / period, output="sos"), forces)
+    return float(np.sqrt(np.mean(ripple[-_RIPPLES_FOR:] ** 2))) > _RIPPLE_N * _RADIUS
+
+
 def _counted(draw: int) -> tuple[int, list[Quiet]]:
     strikes = list(quiet_strikes(draw))
     return len(strikes), [strike for strike in strikes if strike.told]
 
 
 def main(draws: int) -> None:
-    """Print how many strikes are quiet, of how many the guard tells, and how many were thrown."""
-    quiet = told = thrown = 0
+    """Print how many strikes are quiet, of how many the guard tells, and of what."""
+    quiet = told = thrown = buzzed = 0
     with Pool() as pool:
         for count, alarms in pool.imap_unordered(_counted, range(draws), 8):
             quiet, told = quiet + count, told + len(alarms)
             thrown += sum(strike.thrown for strike in alarms)
+            buzzed += sum(strike.buzzed and not strike.thrown for strike in alarms)
             for strike in alarms:
-                if not strike.thrown:
-                    print(f"not thrown: {strike.wall}", flush=True)
-    print(f"{quiet} quiet strikes; the guard told of {told}, of which {thrown} were thrown")
+                if not (strike.thrown or strike.buzzed):
+                    print(f"false alarm: {strike.wall}", flush=True)
+    print(f"{quiet} quiet strikes; the guard told of {told}: {thrown} thrown, {buzzed} had buzzed")
 
 
 if __name__ == "__main__":
