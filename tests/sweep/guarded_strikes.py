@@ -25,12 +25,14 @@ from canwall.sweep.strike import OPERATORS, SERVOS
 from canwall.walls import LAWS
 
 CONFIGURATION = load(Path(__file__).parents[2] / "config" / "sim.toml")
-#: No law for a bench; the walls of the others, the speeds [rad/s] and the dampings B·T/m.
+#: `rigid` is no law for a bench.
 _LAWS = [name for name in LAWS if name != "rigid"]
+#: Walls of laws with a model [N·m/rad], speeds [rad/s], and B·T/m of laws that ask for a damping.
 _STIFFNESSES, _SPEEDS = (30.0, 5000.0), (0.2, 2.0)
 _DAMPINGS = (0.05, 0.1, 0.2, 0.3, 0.4)
-#: Those that ask for no model are soft [N·m/rad], and up to this share of m/T² more.
+#: Walls of sampled laws: from this [N·m/rad] on, up to twice that and this share of m/T².
 _SAMPLED_SOFTEST, _SAMPLED_SHARE = 5.0, 0.15
+#: Walls in a draw.
 _WALLS = 12
 #: Felt while it comes to rest [N].
 _FELT_N = 0.1
@@ -107,7 +109,8 @@ def throws(positions: NDArray[np.float64]) -> bool:
     inside = positions < 0.0
     entered = np.flatnonzero(~inside[:-1] & inside[1:]) + 1
     left = np.flatnonzero(inside[:-1] & ~inside[1:]) + 1
-    for end in left[left >= len(positions) - _TOLD_WITHIN]:
+    # The speed after a contact takes one sample more.
+    for end in left[(left >= len(positions) - _TOLD_WITHIN) & (left < len(positions) - 1)]:
         (begin,) = entered[entered < end][-1:]
         came = positions[begin - 2] - positions[begin - 1]
         if positions[end + 1] - positions[end] > _FASTER * came:
