@@ -2,9 +2,10 @@
 
 State and model in force are interpolated between the two filters next to the mass that a regression
 finds (`regression`), at the delay that it finds. The gains of the filters are made beforehand
-(`bank_gains`); stiffness and motion decide which of them are in force (`bank_pace`). Coulomb
-friction is left to the bias force d̂ (docs/laws.md). A hand that is known has a bank of one filter:
-it holds its mass, and finds the delay.
+(`bank_gains`); stiffness and motion decide which of them are in force (`bank_pace`). Those of light
+hands also follow how fast the push changes (`bank_trend`). Coulomb friction is left to the bias
+force d̂ (docs/laws.md). A hand that is known has a bank of one filter: it holds its mass, and finds
+the delay.
 
 The bank works on an estimator in its steady state and hands over state and model to it. In a gap
 of samples, and until the estimator has nearly settled again, the estimator goes on alone and the
@@ -19,17 +20,24 @@ from numpy.typing import NDArray
 from canwall.compiled import Record, compiled
 from canwall.walls.bank_gains import PACES, QUICKER, STEADIEST, set_filters, stiffest_walls
 from canwall.walls.bank_pace import CALM_S, LIVELY_S, is_lively
+from canwall.walls.bank_trend import (
+    correct_in_flight,
+    follow_trend,
+    follows_trend,
+    note_flight,
+    reset_trend,
+    set_trend,
+    trend_left,
+)
 from canwall.walls.estimator import MAX_DELAY, set_model, set_model_delay, settle_within
 from canwall.walls.probe import (
     PROBE,
-    other_torque_acts,
     probe_torque,
     reset_probe,
     send_probe,
     set_probe,
 )
 from canwall.walls.regression import (
-    HAND_RATE,
     KNOWN_SPREAD,
     OBSERVER_SLOWER_BEHIND_SHAFT,
     REGRESSION,
@@ -37,7 +45,6 @@ from canwall.walls.regression import (
     comes,
     forget_mass,
     learn,
-    moves,
     predict_regression,
     reset_regression,
     set_regression,
@@ -157,20 +164,6 @@ _NEARLY_SETTLED = 0.01
 _FORGOTTEN_S = 0.2
 #: Share of the way to the likeliest mass that is gone in a period.
 _FOLLOWED = 0.6
-#: Time without torque but a probe's after which a handle that moves flies, and time constant with
-#: which the trend of the push is forgotten in contact [s]: what a blow and the push after it do to
-#: an estimate is no trend.
-_FLIGHT_S, _TREND_S = 0.04, 0.0028
-#: That time constant under the wall's torque [s] if the handle came with no more than this speed
-#: [rad/s], since its blow is small and its push goes on growing, and if K·T²/m of the lightest hand
-#: is no less than this: a softer wall is as deep as it should be anyway, and a trend that is kept
-#: makes its handle swing.
-_TREND_PRESSED_S, _SLOW_COMING, _STIFF = 0.007, 2.8, 0.6
-#: Time after a flight in which a hand begins to press [s], the sample under the wall's torque from
-#: which on it does, and the largest speed at which one tells how its push changes [rad/s]. Earlier
-#: and faster it is a blow, whose errors are those of delay and mass; later, with friction, the
-#: trend would make the handle hunt.
-_LANDING_S, _PRESSED, _SLOW = 0.04, 4, 0.38
 #: Deviation of ln(mass) below which the mass counts as found.
 _FOUND_SPREAD = 0.2
 #: Lightest mass that explains the motion of a hand that is known, over the one told.
@@ -220,11 +213,7 @@ def set_bank(
     bank["spring"] = spring
     bank["forgotten"] = round(_FORGOTTEN_S / period)
     bank["lively"], bank["calm"] = round(LIVELY_S / period), round(CALM_S / period)
-    bank["flight"] = round(_FLIGHT_S / period)
-    bank["trend_left_pressed"] = math.exp(-period / _TREND_PRESSED_S)
-    bank["trend_left"] = math.exp(-period / _TREND_S)
-    bank["stiff_from"] = _STIFF * masses[0] / period**2
-    bank["landing"] = round(_LANDING_S / period)
+    set_trend(bank, masses[0], period)
     told = delay - margin
     bank["delay"], bank["told"] = delay, told
     lightest = float(masses[0])
@@ -246,10 +235,9 @@ def set_bank(
 
 def reset_bank(bank: NDArray[np.void], y: float) -> None:
     """Begin at rest at y with the lightest hand."""
-    bank["state"] = bank["trend"] = 0.0
-    bank["alone"], bank["flies"], bank["came_slowly"], bank["stiff"] = 0, False, False, False
-    bank["landed"], bank["pressed"], bank["presses"] = bank["landing"], 0, False
+    bank["state"] = 0.0
     bank["state"][:, 0] = y
+    reset_trend(bank)
     reset_regression(bank["regression"][0, 0], y)
     reset_probe(bank["probe"][0, 0])
     bank["place"], bank["spread"], bank["known"] = 0.0, 0.0, False
@@ -279,14 +267,13 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
         begin_regression(bank.regression[0], y_sample, estimator.v, torque)
         bank.probe[0].samples = 0
         return False
-    _note_flight(bank, estimator, y_sample)
-    slow = _SLOW * bank.regression[0].period + bank.regression[0].resolution
-    follows = bank.presses and abs(y_sample - bank.sampled) <= slow
+    note_flight(bank, estimator, y_sample)
+    follows = follows_trend(bank, y_sample)
     step = _torque_step(bank, estimator)
     for i in range(n):
         residual = y_sample - state[0, i]
         if bank.flies and bank.gain_in_flight[0, i] > 0.0:
-            _correct_in_flight(bank, i, residual)
+            correct_in_flight(bank, i, residual)
             continue
         far = residual - min(max(residual, -bank.far), bank.far)
         near = residual - far
@@ -297,7 +284,7 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
         state[0, i] += share * residual
         state[1, i] += share * residual / bank.regression[0].period
         if follows:
-            _follow_trend(bank, i, bank.trend_gain[i] * gain[2, i] * (near + far))
+            follow_trend(bank, i, bank.trend_gain[i] * gain[2, i] * (near + far))
     _bound_velocity(bank, y_sample)
     changed = _identify(bank, estimator, y_sample)
     changed |= _follow_delay(bank, estimator)
@@ -319,33 +306,6 @@ def follow_estimator(bank: Record, estimator: Record) -> None:
 
 
 @compiled
-def _note_flight(bank: Record, estimator: Record, y_sample: float) -> None:
-    """Note if the handle flies, or is pressed against the wall shortly after a flight.
-
-    A flight is its way far from any contact, under no torque but a probe's.
-    """
-    probe, now = bank.probe[0], estimator.delay_periods
-    bank.alone = 0 if other_torque_acts(probe, estimator.in_flight, now) else bank.alone + 1
-    bank.flies = bank.alone > bank.flight and moves(bank.regression[0])
-    bank.landed = 0 if bank.flies else bank.landed + 1
-    if bank.landed <= 1:  # the first sample of the contact is still the flight's
-        way = abs(y_sample - bank.sampled)
-        bank.came_slowly = way <= _SLOW_COMING * bank.regression[0].period
-    wall_acts = estimator.in_flight[now] != probe.in_flight[now]
-    bank.pressed = bank.pressed + 1 if wall_acts else 0
-    bank.presses = bank.landed <= bank.landing and bank.pressed >= _PRESSED
-
-
-@compiled
-def _trend_left(bank: Record) -> float:
-    """Return the share of the trend that is left after a period."""
-    if bank.flies or bank.presses:
-        return 1.0
-    goes_on = bank.stiff and bank.pressed > 0 and bank.came_slowly
-    return bank.trend_left_pressed if goes_on else bank.trend_left
-
-
-@compiled
 def _torque_step(bank: Record, estimator: Record) -> float:
     """Return the step of the wall's torque in the period up to this sample [N·m]."""
     now, probes = estimator.delay_periods, bank.probe[0].in_flight
@@ -364,25 +324,6 @@ def _untimely_share(bank: Record, i: int, step: float) -> float:
     """
     ratio = bank.untimely[i] * step * step * (1.0 - bank.gain[0, i])
     return ratio / (1.0 + ratio)
-
-
-@compiled
-def _correct_in_flight(bank: Record, i: int, residual: float) -> None:
-    """Correct filter i, and how fast the push changes.
-
-    A light handle is at the wall within a few samples, and what its filter is behind of a push that
-    grows is then missing from the first blow.
-    """
-    state, gain = bank.state, bank.gain_in_flight
-    for c in range(3):
-        state[c, i] += gain[c, i] * residual
-    _follow_trend(bank, i, gain[3, i] * residual)
-
-
-@compiled
-def _follow_trend(bank: Record, i: int, correction: float) -> None:
-    """Correct how fast the push changes: no faster than that of a hand."""
-    bank.trend[i] = min(max(bank.trend[i] + correction, -HAND_RATE), HAND_RATE)
 
 
 @compiled
@@ -594,7 +535,7 @@ def predict_bank(bank: Record, estimator: Record, force: float, age: float = 0.0
     predict_regression(bank.regression[0], estimator.in_flight, force, age)
     send_probe(bank.probe[0], force)
     state, phi = bank.state, bank.phi
-    left = _trend_left(bank)
+    left = trend_left(bank)
     for i in range(bank.count):
         change = bank.regression[0].period * bank.trend[i]
         y, v, d = state[0, i], state[1, i], state[2, i] + 0.5 * change
