@@ -46,8 +46,6 @@ from canwall.run import (
 _SETTLING_S = 0.3
 #: Share of cycles that may miss their TPDO in a cycle that counts as held.
 _MISSED_SHARE = 1e-3
-#: Interfaces whose frames take no time on a wire.
-_WITHOUT_BIT_RATE = ("virtual", "unixcan")
 
 #: Program of a busy process, which ends with the process that started it.
 _COMPUTE = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: sum(range(100_000))"
@@ -329,7 +327,7 @@ def shortest_cycle(
     """
     bus = settings.bus
     worst = max(phases, key=lambda phase: phase.sync_to_rpdo.p999_us)
-    wire = budget.bits if _without_bit_rate(settings) else budget.lines[-1].bits
+    wire = budget.lines[-1].bits if settings.bus.has_wire else budget.bits
     by_bus_s = 1.0 / budget.highest_hz
     by_machine_s = worst.sync_to_rpdo.p999_us * 1e-6 + wire / bus.bitrate
     missing = next((p for p in phases if p.missed_tpdo > _MISSED_SHARE * p.cycles), None)
@@ -361,11 +359,6 @@ def shortest_cycle(
         by_machine_s,
         f"{held} a cycle of {holds_s * 1e3:.2f} ms ({math.floor(1.0 / holds_s)} Hz), {why}",
     )
-
-
-def _without_bit_rate(settings: Settings) -> bool:
-    bus = settings.bus
-    return bus.interface in _WITHOUT_BIT_RATE or bus.channel.startswith("vcan")
 
 
 def _when(phase: LatencyPhase) -> str:

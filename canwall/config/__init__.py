@@ -42,6 +42,7 @@ from canwall.config.settings import (
     Wall,
     WallChange,
     check_divider,
+    has_wire,
 )
 from canwall.config.simulation import Simulation
 from canwall.errors import ConfigError
@@ -80,6 +81,7 @@ __all__ = [
     "check_divider",
     "check_values",
     "first_error",
+    "has_wire",
     "load",
     "located",
     "named",

@@ -53,6 +53,16 @@ class Bus(Section):
     processor: Annotated[int, Field(ge=0, le=4095)] | None = None
     master_id: int = Field(127, ge=1, le=127)
 
+    @property
+    def has_wire(self) -> bool:
+        """True if a real drive may be on the bus, as far as the names of `[bus]` tell."""
+        return has_wire(self.interface, self.channel)
+
+
+def has_wire(interface: str, channel: str) -> bool:
+    """Return False for a bus that exists in this machine alone."""
+    return interface not in ("virtual", "unixcan") and not channel.startswith("vcan")
+
 
 class Mechanics(Section):
     """`[mechanics]`: the model of everything that moves, as the laws use it.
@@ -479,11 +489,13 @@ class Settings(Section):
         """True if SYNCs follow the clock, False if they go as fast as the simulation answers.
 
         A wall in memory without an end is one to be watched: as fast as possible, its record would
-        grow by megabytes a second.
+        grow by megabytes a second. On a wire the drive may be a real one, also if the file has a
+        simulated one for its sweeps.
         """
         if self.bus.pace == "auto":
             endless = self.embedded and self.run.duration_s is None
-            return self.simulation is None or self.simulation.real_time or endless
+            simulated = self.simulation is not None and not self.simulation.real_time
+            return not simulated or endless or self.bus.has_wire
         return self.bus.pace == "real_time"
 
     def to_toml(self) -> str:

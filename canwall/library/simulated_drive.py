@@ -13,7 +13,7 @@ from typing import Any, Self
 from pydantic import ValidationError
 
 from canwall.bus import open_bus
-from canwall.config import Bus, Drive, Fault, Settings, Simulation, first_error, shipped
+from canwall.config import Bus, Drive, Fault, Settings, Simulation, first_error, has_wire, shipped
 from canwall.errors import ConfigError
 from canwall.faults import KINDS, FaultKind
 from canwall.library.arguments import as_dict, as_path
@@ -164,7 +164,7 @@ class SimulatedDrive:
         load_compiled_code(self._device.real_time)
         self._bus = open_bus(self.interface, self.channel, self._bitrate)
         # A real controller makes error frames itself; given one, it sends it as data.
-        virtual = self.interface in ("virtual", "unixcan") or self.channel.startswith("vcan")
+        virtual = not has_wire(self.interface, self.channel)
         try:
             runner = BusRunner(self._shared, self._bus, error_frames=virtual, report=self._report)
             time.sleep(_POLL_S)

@@ -570,6 +570,10 @@ def test_laws_take_turns_with_their_own_options(loaded: Load) -> None:
         ({"simulation": {}, "bus.pace": "simulated"}, True, False),
         ({"simulation": {}, "bus.pace": "real_time"}, True, True),
         ({"simulation": {}, "bus.interface": "unixcan"}, False, False),
+        ({"simulation": {}, "bus.interface": "socketcan", "bus.channel": "vcan1"}, False, False),
+        # There may be a real drive, and the file may have a simulated one for its sweeps.
+        ({"simulation": {}, "bus.interface": "socketcan", "bus.channel": "can0"}, False, True),
+        ({"simulation": {}, "bus.interface": "pcan", "run.duration_s": 1}, False, True),
         ({"bus.pace": "simulated"}, False, False),
     ],
 )

@@ -52,7 +52,8 @@ def controllers() -> Iterator[tuple[str, str]]:
 
 def _strike(bench: Bench, controllers: tuple[str, str], duration_s: float) -> Record:
     of_the_drive, of_the_master = (
-        bench.config({'channel = "vcan0"': f'channel = "{name}"'}) for name in controllers
+        bench.config({'channel = "vcan0"': f'channel = "{name}"\npace = "simulated"'})
+        for name in controllers
     )
     bench.drive(of_the_drive)
     folder = bench.folder / "run"
