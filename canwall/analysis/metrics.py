@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.analysis.felt import FELT_BAND_HZ, QUIET_N
+from canwall.analysis.restitution import kicks, largest_restitution
 from canwall.compiled import compiled
 
 Array = NDArray[np.float64]
@@ -113,7 +114,7 @@ class Chatter:
 
     chatters: bool
     reason: str
-    by: Literal["", "counts", "amplitude", "ripple", "limits"] = ""
+    by: Literal["", "counts", "kick", "amplitude", "ripple", "limits"] = ""
 
 
 @dataclass(frozen=True)
@@ -154,13 +155,15 @@ def chatter(
     count: float,
     gives_energy: bool = True,
     ripple: Ripple | None = None,
+    swing_samples: int = 1,
 ) -> Chatter:
     """Judge whether a wall chattered in one strike.
 
-    Chatter is more makes and breaks of contact than the referent has (`bounces_more`), motion
-    about the settled contact that exceeds the referent's by more than `tolerance`, or a felt ripple
-    that exceeds the referent's by more than QUIET_N. Without a referent (a person at the handle)
-    the motion is not judged.
+    Chatter is more makes and breaks of contact than the referent has (`bounces_more`), a contact
+    that is left faster than it was entered (`restitution.kicks`), motion about the settled contact
+    that exceeds the referent's by more than `tolerance`, or a felt ripple that exceeds the
+    referent's by more than QUIET_N. Without a referent (a person at the handle, who may pull) kicks
+    and motion are not judged.
 
     Args:
         y: Positions relative to the wall over the strike, shape (n,).
@@ -170,6 +173,7 @@ def chatter(
         count: One encoder count, in the unit of y.
         gives_energy: True if the wall put out energy in the strike.
         ripple: Felt ripple, if it is known.
+        swing_samples: Samples in a period of the shaft's resonance.
     """
     ripple = Ripple() if ripple is None else ripple
     # The busiest window of each is compared, not window by window: a wall that loses some energy
@@ -191,6 +195,12 @@ def chatter(
             return Chatter(True, felt, "ripple")
         return Chatter(False, "too few makes and breaks; amplitude not judged without a referent")
     _, start, stop = settled_window(referent, tolerance, cycle_s)
+    until = judged_until(start, stop, len(y))
+    if kicks(y[:until], referent[:until], count, swing_samples):
+        times = largest_restitution(y[:until], count, swing_samples)
+        return Chatter(
+            True, f"a contact is left {times:.3g} times as fast as it was entered", "kick"
+        )
     if start == stop:
         return Chatter(False, "the referent never settles; amplitude not judged")
     measured, own = peak_to_peak(y[start:stop]), peak_to_peak(referent[start:stop])
@@ -291,6 +301,12 @@ def judged_part(start: int, stop: int) -> tuple[int, int]:
     """Return the part of a stretch in which the wall is at rest: its second half but the end."""
     length = stop - start
     return start + length // 2, start + length * 9 // 10
+
+
+@compiled
+def judged_until(start: int, stop: int, cycles: int) -> int:
+    """Return the cycle up to which contacts are judged, before the hand leaves where it settles."""
+    return stop if stop > start else cycles
 
 
 @compiled

@@ -63,7 +63,8 @@ class AskedWall(NamedTuple):
         stiffness: K [N·m/rad].
         damping: B [N·m·s/rad].
         damping_ratio: ζ of the damping, in place of B; 0: none.
-        cap: c of the largest stiffness c·m/T²; 0: none.
+        cap: c of the largest stiffness c·m/T², with T of the SYNC: for a law evaluated every n
+            periods, that of `[wall]` over n²; 0: none.
     """
 
     stiffness: Array

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from canwall.analysis import metrics
 from canwall.analysis.felt import FeltBand, band_rms
+from canwall.analysis.restitution import SPAN, first_bounce, kicks
 from canwall.compiled import Record, compiled
 
 Array = NDArray[np.float64]
@@ -16,10 +17,12 @@ MEASURES = np.dtype(
     [
         ("chatters", "?"),
         ("chatters_counts", "?"),
+        ("chatters_kick", "?"),
         ("chatters_amplitude", "?"),
         ("chatters_ripple", "?"),
         ("settled", "?"),
         ("trip", "i1"),
+        ("alarms", "i4"),
         ("contacts", "i4"),
         ("events", "i4"),
         ("referent_events", "i4"),
@@ -55,10 +58,12 @@ MEASURE_DESCRIPTIONS = {
         "chatter by docs/results.md, or a trip while the referent stays within the limits",
     ),
     "chatters_counts": ("1", "chatter by makes and breaks of contact"),
+    "chatters_kick": ("1", "chatter by a contact that is left faster than it was entered"),
     "chatters_amplitude": ("1", "chatter by the motion about the settled contact"),
     "chatters_ripple": ("1", "chatter by the felt ripple"),
     "settled": ("1", "the referent settles, so that motion and ripple can be judged"),
     "trip": ("1", "the limit that ended the strike (cycle.Trip), 0: none"),
+    "alarms": ("1", "alarms of the guard"),
     "contacts": ("1", "contacts of the strike"),
     "events": ("1", "makes and breaks of contact within the busiest 200 ms"),
     "referent_events": ("1", "the same of the continuous referent"),
@@ -85,9 +90,6 @@ MEASURE_DESCRIPTIONS = {
     "referent_restitution": ("1", "the same of the continuous referent"),
 }
 
-#: Samples over which speeds before and after a contact, and the rise of the force, are averaged.
-SPAN = 5
-
 
 @compiled
 def measure_strike(
@@ -96,6 +98,7 @@ def measure_strike(
     torque: Array,
     trip: int,
     thrown: bool,
+    alarms: int,
     felt: Array,
     in_force: Array,
     referent: Array,
@@ -106,6 +109,7 @@ def measure_strike(
     count: float,
     torque_step: float,
     stiffness: float,
+    swing_samples: int,
     measures: NDArray[np.void],
 ) -> None:
     """Measure one strike.
@@ -116,6 +120,7 @@ def measure_strike(
         torque: Commanded torques [N·m], shape (n,).
         trip: The limit that ended the strike, 0 for none.
         thrown: True if the wall threw the handle beyond limits that the referent keeps.
+        alarms: Alarms of the guard.
         felt: Mean forces on the hand over each period [N·m], shape (n,).
         in_force: Stiffness in force [N·m/rad] and mass in the laws' model [kg·m²], shape (2, n).
         referent: Positions of the continuous referent [rad], shape (n,).
@@ -126,12 +131,14 @@ def measure_strike(
         count: One encoder count Δ [rad].
         torque_step: One step of torque f_LSB [N·m].
         stiffness: Stiffness asked for [N·m/rad].
+        swing_samples: Samples in a period of the shaft's resonance.
         measures: Result, shape (1,), dtype MEASURES.
     """
     into: Record = measures[0]
     window = metrics.event_window(period)
     tolerance = metrics.amplitude_tolerance(stiffness, count, torque_step)
     into.trip = trip
+    into.alarms = alarms
     into.tolerance = tolerance
     into.events = metrics.busiest_window(y, window, count)
     into.referent_events = metrics.busiest_window(referent, window, count)
@@ -149,9 +156,11 @@ def measure_strike(
     into.chatters_counts = metrics.bounces_more(
         into.events, into.referent_events, into.energy_out > into.energy_tolerance
     )
+    until = metrics.judged_until(start, stop, len(y))
+    into.chatters_kick = kicks(y[:until], referent[:until], count, swing_samples)
     into.chatters_amplitude = metrics.moves_more(into.motion, into.referent_motion, tolerance)
     into.chatters_ripple = metrics.is_felt(into.ripple, into.referent_ripple)
-    moves = thrown or into.chatters_counts or into.chatters_amplitude
+    moves = thrown or into.chatters_counts or into.chatters_kick or into.chatters_amplitude
     into.chatters = moves or into.chatters_ripple
     first, after, contacts = _count_contacts(y, force)
     into.contacts = contacts
@@ -259,52 +268,3 @@ def first_depth(y: Array) -> float:
         if deepest > 0.0 and position >= 0.0:
             break
     return deepest if deepest > 0.0 else math.nan
-
-
-@compiled
-def _fastest_crossing(y: Array, inside: int, step: int, count: float) -> float:
-    """Return the fastest mean from a sample inside to one of the next SPAN outside, less a count.
-
-    In radians a sample; that quantisation makes a way longer shall not make it faster. step: 1 for
-    the samples after the one inside, −1 for those before it.
-    """
-    fastest = 0.0
-    for n in range(1, SPAN + 1):
-        outside = inside + step * n
-        if not 0 <= outside < len(y) or y[outside] < 0.0:
-            break
-        fastest = max(fastest, (y[outside] - y[inside] - count) / n)
-    return fastest
-
-
-@compiled
-def first_bounce(y: Array, period: float, count: float) -> tuple[float, float]:
-    """Return the speed into the first contact and the restitution; NaN if there is none.
-
-    Both speeds are the fastest of means: of those over SPAN samples outside, and of those between
-    the samples next to the contact, less a count, since hand and friction change the speed within
-    SPAN samples. On approach all means count that end within the last SPAN samples before the
-    contact: a wall may act ahead of its surface.
-    Where a wall has stopped the handle before its surface, it creeps in: below a count a sample its
-    speed says nothing, and the restitution is the speed on leaving over a count a sample.
-    """
-    enter = 0
-    while enter < len(y) and y[enter] >= 0.0:
-        enter += 1
-    if enter <= SPAN or enter >= len(y):
-        return math.nan, math.nan
-    approach = _fastest_crossing(y, enter, -1, count)
-    for j in range(max(enter - SPAN, SPAN), enter):
-        approach = max(approach, (y[j - SPAN] - y[j]) / SPAN)
-    leave = enter
-    while leave < len(y) and y[leave] < 0.0:
-        leave += 1
-    back = leave
-    while back < len(y) and back < leave + SPAN and y[back] >= 0.0:
-        back += 1
-    if approach == 0.0 or back == len(y):
-        return -approach / period, math.nan
-    out = _fastest_crossing(y, leave - 1, 1, count)
-    if y[back] >= 0.0:
-        out = max(out, (y[back] - y[leave]) / SPAN)
-    return -approach / period, out / max(approach, count)

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from canwall.analysis import metrics
 from canwall.analysis.felt import band_rms, felt_band, handle_radius
-from canwall.analysis.strike import SPAN, first_bounce, first_depth, least_in_contact, pressed_cycle
+from canwall.analysis.restitution import SPAN, first_bounce, swing_samples
+from canwall.analysis.strike import first_depth, least_in_contact, pressed_cycle
 from canwall.config import Settings
 from canwall.record.columns import Phase
 from canwall.record.folder import numbers
@@ -146,7 +147,8 @@ def _strike(
     if referent is None or referent_felt is None:
         ripple, judged = _ripple_of_contact(strike, force, settings)
     else:
-        seen = slice(_last_outside(y, referent, start, units.rad_per_count), cycles.stop)
+        outside = _last_outside(y, referent, start, units.rad_per_count)
+        seen = slice(max(outside - SPAN, 0), cycles.stop)  # with the speed of approach
         rest, first, last = metrics.settled_window(referent[seen], tolerance, period)
         windows = (rest + seen.start, first + seen.start, last + seen.start)
         judged = slice(*windows[1:])
@@ -161,6 +163,7 @@ def _strike(
         units.rad_per_count,
         bool(running.max() > energy_tolerance),
         ripple,
+        swing_samples(settings.simulation.shaft_hz if settings.simulation else 0.0, period),
     )
     if thrown:
         verdict = metrics.Chatter(True, "it threw the handle beyond the limits", "limits")

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from canwall.analysis import AskedWall, metrics
 from canwall.analysis.strike import keeps_limits
@@ -134,6 +135,8 @@ def judged(
     # A referent that exceeds them somewhat later exceeds them.
     more = (0, metrics.event_window(settings.bus.cycle_s) if exceeded else 0)
     asked = AskedWall(*(np.pad(numbers(signals, n), more, "edge") for n in AskedWall._fields))
+    divider = np.pad(_dividers(numbers(signals, "j"), settings), more, "edge")
+    asked = asked._replace(cap=asked.cap / divider**2)
     wall_position = np.pad(numbers(signals, "wall_position_rad"), more, "edge")
     referent = referent_motion(settings, asked, wall_position, delay_told(signals))
     if referent is None:
@@ -148,6 +151,14 @@ def judged(
         y, felt = (values[: signals.num_rows] for values in referent)
         found = summarise(signals, settings, units, y, felt, thrown)
     return found | {"motion_delay_cycles": motion_delay}
+
+
+def _dividers(j: NDArray[np.float64], settings: Settings) -> NDArray[np.float64]:
+    """Return the divider of each cycle by `[wall]` and `[[schedule]]`."""
+    stages = settings.stages
+    begins = np.array([stage.at_s for stage in stages]) / settings.bus.cycle_s
+    dividers = np.array([stage.wall.divider for stage in stages], float)
+    return dividers[np.maximum(np.searchsorted(begins, j, side="right") - 1, 0)]
 
 
 def delay_told(signals: "pa.Table") -> float:

@@ -381,6 +381,7 @@ def _write_cap(dataset: xr.Dataset) -> Iterator[str]:
                 ("chatters_ripple", "with a felt ripple"),
                 ("chatters_amplitude", "with motion about the settled contact"),
                 ("chatters_counts", "with more makes and breaks"),
+                ("chatters_kick", "with a kick"),
             ):
                 of_kind = dataset[criterion].sel(some)
                 each = [of_kind.sel(operator=operator) for operator in operators]

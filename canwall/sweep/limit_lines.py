@@ -81,7 +81,7 @@ def _limits(dataset: xr.Dataset, low: float, high: float) -> list[tuple[Limit, A
     dampings = np.unique(np.concatenate((dampings, fine[(low <= fine) & (fine <= high)])))
     approximate = [delayed_stiffness(viscous, b, period, delay) for b in dampings]
     limits = [(Limit.DELAYED, np.array(approximate), dampings)]
-    if delay not in CEILINGS and delay != int(delay):
+    if delay != int(delay):
         return limits
     whole = int(delay)
     exact = [stable_stiffness(mass, viscous, b, period, whole) for b in dampings]

@@ -39,7 +39,7 @@ PieceResult = tuple[int, NDArray[np.void]]
 _PIECE, _PIECE_BY_FRAMES = 120, 4
 #: Processor time in a single evaluation after which a law counts as one that does not return [s].
 _LAW_S = 0.5
-#: The largest result: 1.5 GB.
+#: The largest result: some 2 GB.
 _MOST_POINTS = 10_000_000
 
 

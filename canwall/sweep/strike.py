@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from canwall.analysis import AskedWall, ReferentInputs, follow_referent
 from canwall.analysis.felt import HANDLE_RADIUS_M, FeltBand, felt_band, handle_radius
+from canwall.analysis.restitution import swing_samples
 from canwall.analysis.strike import MEASURES, keeps_limits, measure_strike
 from canwall.compiled import Record, compiled
 from canwall.config import ConfigError, Hand, Mechanics, Settings, Simulation
@@ -123,6 +124,9 @@ def law_model(settings: Settings, knows: str, error: float) -> Mechanics:
         settings: Configuration with `[simulation]`.
         knows: "matched": drive and hand; "drive": the drive alone; "file": `[mechanics]`.
         error: Relative error of the inertia.
+
+    Raises:
+        ConfigError: If that leaves less than the rotor of an elastic shaft.
     """
     simulation = settings.simulation
     assert simulation is not None
@@ -142,7 +146,13 @@ def law_model(settings: Settings, knows: str, error: float) -> Mechanics:
         )
         if simulation.shaft_hz:
             model = model.model_copy(update=_known_shaft(simulation, model.inertia_kg_m2))
-    return model.model_copy(update={"inertia_kg_m2": model.inertia_kg_m2 * (1.0 + error)})
+    inertia = model.inertia_kg_m2 * (1.0 + error)
+    if model.shaft_hz and model.rotor_inertia_kg_m2 and inertia <= model.rotor_inertia_kg_m2:
+        raise ConfigError(
+            f"sweep axis model_error: with {error:g} the model's inertia is {inertia:.3g} kg·m², "
+            f"and its rotor alone has {model.rotor_inertia_kg_m2:.3g} kg·m²"
+        )
+    return model.model_copy(update={"inertia_kg_m2": inertia})
 
 
 def _known_shaft(simulation: Simulation, inertia: float) -> dict[str, float]:
@@ -260,26 +270,37 @@ class PreparedStrike:
         assert settings.simulation is not None
         self._settings = settings
         self._cycles = round(settings.run.duration_s / settings.bus.cycle_s)
-        self._loop = ClosedLoop(
-            settings,
-            self._cycles,
-            disturbances=Disturbances.jitter(
-                self._cycles, sync_jitter_s, settings.bus.cycle_s, settings.simulation.seed
-            ),
-        ).records()
+        self._disturbances = Disturbances.jitter(
+            self._cycles, sync_jitter_s, settings.bus.cycle_s, settings.simulation.seed
+        )
+        self._prepare(settings.wall.damping_nm_s_per_rad)
         referent = Referent(settings, settings.simulation, self._cycles)
         self._referent = referent.inputs(np.full(self._cycles, settings.wall.position_rad))
         # Each wall fills in its own stiffness and damping.
         wall = settings.wall
+        cap = wall.cap / wall.divider**2
         self._asked = AskedWall(
-            *(np.full(self._cycles, value) for value in (0.0, 0.0, wall.damping_ratio, wall.cap))
+            *(np.full(self._cycles, value) for value in (0.0, 0.0, wall.damping_ratio, cap))
         )
-        #: The referent is no stiffer than shaft, delay and encoder bear.
-        self._stiffest = stiffest_for(self._loop.cycle, settings, self.mass)
         self._band = felt_band(settings.bus.cycle_s)
         self._radius = handle_radius(settings.mechanics.handle_radius_m)
+        self._swing_samples = swing_samples(settings.simulation.shaft_hz, settings.bus.cycle_s)
         self._by_frames = through == "bus"
         self.law = named_law(settings)
+
+    def _prepare(self, damping: float) -> None:
+        """Prepare the loop for walls of this damping, which bounds the stiffness on a shaft."""
+        wall = self._settings.wall.model_copy(update={"damping_nm_s_per_rad": damping})
+        settings = self._settings.model_copy(update={"wall": wall})
+        self._damping = damping
+        self._loop = ClosedLoop(settings, self._cycles, disturbances=self._disturbances).records()
+        #: The referent is no stiffer than shaft, delay and encoder bear.
+        self._stiffest = stiffest_for(self._loop.cycle, settings, self.mass)
+
+    def _prepare_for(self, damping: float) -> None:
+        """Prepare the loop anew if it is one for walls of another damping."""
+        if damping != self._damping and self._settings.mechanics.shaft_hz:
+            self._prepare(damping)
 
     @property
     def mass(self) -> float:
@@ -338,22 +359,33 @@ class PreparedStrike:
             for i, (stiffness, damping) in enumerate(walls.tolist()):
                 measures[i] = self._strike_over_bus(stiffness, damping)
         else:
-            # One call for all walls: between calls, the threads of a sweep would contend for the
-            # interpreter's lock.
-            _strike_all(
-                self._loop,
-                self._referent,
-                AskedWall(*(values.copy() for values in self._asked)),
-                self._band,
-                self._radius,
-                self._stiffest,
-                walls,
-                np.zeros(1, ROW),
-                measures,
-            )
+            # One call for all walls of a shaft's bound: between calls, the threads of a sweep would
+            # contend for the interpreter's lock.
+            for some in self._bounded_alike(walls):
+                self._prepare_for(walls[some][0, 1])
+                struck = measures[some]
+                _strike_all(
+                    self._loop,
+                    self._referent,
+                    AskedWall(*(values.copy() for values in self._asked)),
+                    self._band,
+                    self._radius,
+                    self._swing_samples,
+                    self._stiffest,
+                    walls[some],
+                    np.zeros(1, ROW),
+                    struck,
+                )
+                measures[some] = struck
         for wall in walls[measures["trip"] == Trip.NOT_A_NUMBER][:1]:
             self._refuse_failed_law(*wall.tolist())
         return measures
+
+    def _bounded_alike(self, walls: Array) -> list[NDArray[np.bool_]]:
+        """Return which walls have the same bound of their stiffness: those of one damping."""
+        if not len(walls) or not self._settings.mechanics.shaft_hz:
+            return [np.ones(len(walls), bool)] if len(walls) else []
+        return [walls[:, 1] == damping for damping in np.unique(walls[:, 1])]
 
     def _refuse_failed_law(self, stiffness: float, damping: float) -> NoReturn:
         """Raise RunFailedError for a law that failed on this wall: that is no limit of it."""
@@ -367,6 +399,7 @@ class PreparedStrike:
 
     def motion(self, stiffness: float, damping: float) -> StrikeMotion:
         """Strike a wall of this stiffness [N·m/rad] and damping [N·m·s/rad], in memory."""
+        self._prepare_for(damping)
         rows, measures = np.zeros(self._cycles, ROW), np.zeros(1, MEASURES)
         signals = np.empty((SIGNALS, self._cycles))
         done = simulate_wall(self._loop, stiffness, damping, rows, signals)
@@ -405,6 +438,7 @@ class PreparedStrike:
             self._loop,
             self._band,
             self._radius,
+            self._swing_samples,
             signals,
             trip,
             referent,
@@ -429,6 +463,7 @@ class PreparedStrike:
 
     def _repeat(self, stiffness: float, damping: float) -> Array:
         """Strike a wall in memory; return the signals from the end of enabling on."""
+        self._prepare_for(damping)
         signals = np.empty((SIGNALS, self._cycles))
         done = simulate_wall(self._loop, stiffness, damping, np.zeros(1, ROW), signals)
         return signals[:, self._loop.enabling : done]
@@ -445,6 +480,7 @@ def _strike_all(
     asked: AskedWall,
     band: FeltBand,
     radius: float,
+    swing: int,
     stiffest: float,
     walls: Array,
     rows: NDArray[np.void],
@@ -463,6 +499,7 @@ def _strike_all(
             loop,
             band,
             radius,
+            swing,
             signals[:, loop.enabling : done],
             cycle.trip,
             referent,
@@ -477,6 +514,7 @@ def _judge(
     loop: LoopRecords,
     band: FeltBand,
     radius: float,
+    swing: int,
     signals: Array,
     trip: int,
     referent: Array,
@@ -502,6 +540,7 @@ def _judge(
             cycle.speed_limit,
             cycle.period,
         ),
+        cycle.guard[0].alarms,
         signals[3],
         signals[4:],
         referent[rendered],
@@ -512,6 +551,7 @@ def _judge(
         cycle.rad_per_count,
         cycle.nm_per_mille,
         stiffness,
+        swing,
         measures,
     )
 

@@ -1,8 +1,9 @@
 """Random strikes that are quiet, and what the guard says of them: `guarded_strikes.py [DRAWS]`.
 
 A quiet strike does not chatter, is felt with no more than 0.1 N while it comes to rest, and leaves
-its first contact no faster than it came. A later contact may still throw the handle, which is read
-from the true positions, of which the guard knows nothing; or the wall may have buzzed before.
+its first contact no faster than it came. A later contact may still throw the handle by less than a
+kick, or after its referent has come to rest, which is read from the true positions, of which the
+guard knows nothing; or the wall may have buzzed before.
 """
 
 import math
@@ -43,17 +44,24 @@ _RIPPLE_N, _RIPPLES_FOR, _RADIUS = 0.3, 50, 0.08
 _TOLD_WITHIN, _FASTER = 12, 1.1
 
 
-class Quiet(NamedTuple):
-    """A quiet strike: its wall, True if the guard told of it, and what there was to tell of."""
+class Alarm(NamedTuple):
+    """What there was to tell of in a quiet strike, at the guard's first alarm."""
 
     wall: str
-    told: bool
     thrown: bool
     buzzed: bool
 
+    @property
+    def right(self) -> bool:
+        """True if there was something to tell of."""
+        return self.thrown or self.buzzed
 
-def quiet_strikes(draw: int) -> Iterator[Quiet]:
-    """Yield the quiet ones of the strikes of an operator with a law on walls of any stiffness."""
+
+def quiet_strikes(draw: int) -> Iterator[Alarm | None]:
+    """Yield the alarm of each quiet strike of an operator with a law on walls of any stiffness.
+
+    None where the guard said nothing.
+    """
     rng = np.random.default_rng(draw)
     law, operator, servo = (str(rng.choice(list(names))) for names in (_LAWS, OPERATORS, SERVOS))
     axes: dict[str, Any] = {
@@ -88,13 +96,15 @@ def quiet_strikes(draw: int) -> Iterator[Quiet]:
             continue
         if measures["settling_ripple"] > _FELT_N or measures["restitution"] > 1.0:
             continue
+        if not measures["alarms"]:
+            yield None
+            continue
         signals = np.empty((SIGNALS, cycles))
         simulate_wall(loop, stiffness, damping, np.zeros(cycles, ROW), signals)
         guard = loop.cycle["guard"].reshape(-1)[0]
-        told, at = bool(guard["alarms"]), int(guard["first_alarm"])
-        thrown = told and throws(signals[0, : at + 1])
-        buzzed = told and buzzes(signals[1, : at + 1], prepared.period)
-        yield Quiet(f"{stiffness:.4g} N·m/rad, B {damping:.3g}: {axes}", told, thrown, buzzed)
+        seen = slice(int(guard["first_alarm"]) + 1)
+        thrown, buzzed = throws(signals[0, seen]), buzzes(signals[1, seen], prepared.period)
+        yield Alarm(f"{stiffness:.4g} N·m/rad, B {damping:.3g}: {axes}", thrown, buzzed)
 
 
 def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
@@ -124,9 +134,9 @@ def buzzes(forces: NDArray[np.float64], period: float) -> bool:
     return float(np.sqrt(np.mean(ripple[-_RIPPLES_FOR:] ** 2))) > _RIPPLE_N * _RADIUS
 
 
-def _counted(draw: int) -> tuple[int, list[Quiet]]:
+def _counted(draw: int) -> tuple[int, list[Alarm]]:
     strikes = list(quiet_strikes(draw))
-    return len(strikes), [strike for strike in strikes if strike.told]
+    return len(strikes), [alarm for alarm in strikes if alarm]
 
 
 def main(draws: int) -> None:
@@ -135,11 +145,11 @@ def main(draws: int) -> None:
     with Pool() as pool:
         for count, alarms in pool.imap_unordered(_counted, range(draws), 8):
             quiet, told = quiet + count, told + len(alarms)
-            thrown += sum(strike.thrown for strike in alarms)
-            buzzed += sum(strike.buzzed and not strike.thrown for strike in alarms)
-            for strike in alarms:
-                if not (strike.thrown or strike.buzzed):
-                    print(f"false alarm: {strike.wall}", flush=True)
+            thrown += sum(alarm.thrown for alarm in alarms)
+            buzzed += sum(alarm.buzzed and not alarm.thrown for alarm in alarms)
+            for alarm in alarms:
+                if not alarm.right:
+                    print(f"false alarm: {alarm.wall}", flush=True)
     print(f"{quiet} quiet strikes; the guard told of {told}: {thrown} thrown, {buzzed} had buzzed")
 
 
