@@ -258,9 +258,12 @@ def clear_memory(wall: NDArray[np.void]) -> None:
         wall[name] = 0.0
 
 
-#: Growth in a period of a stiffness that the mass in force allows again: inside the wall, where
-#: the spring is loaded, and outside.
-_GROWTH_INSIDE, _GROWTH_OUTSIDE = 1.03, 1.2
+#: Rise in a period of a stiffness that the mass in force allows again, as a share of itself:
+#: outside the wall, and inside, where the spring is loaded, at most.
+_RISE_OUTSIDE, _RISE_INSIDE = 0.2, 0.03
+#: Energy that a rise inside may add to the loaded spring, over what the damper takes meanwhile; rise
+#: in a period of a wall at rest, where the hand holds against it, as a share of what is allowed.
+_ADDED, _RISE_AT_REST = 1.5, 0.001
 #: Share of the stiffness asked for from which it grows, where no wall was allowed before.
 _LEAST_SHARE = 1e-3
 
@@ -270,13 +273,28 @@ def put_in_force(wall: Record) -> None:
     """Set stiffness and damping in force from those asked for, for the mass of the plant."""
     stiffness = wall.asked_stiffness
     if wall.cap > 0.0:
-        growth = _GROWTH_INSIDE if wall.y_sample < 0.0 else _GROWTH_OUTSIDE
-        allowed = capped_stiffness(stiffness, wall.cap, wall.mass, wall.period)
+        most = min(capped_stiffness(stiffness, wall.cap, wall.mass, wall.period), wall.stiffest)
         before = max(wall.stiffness, _LEAST_SHARE * stiffness)
-        stiffness = min(allowed, wall.stiffest, growth * before)
+        stiffness = min(most, before + _rise(wall, before, most))
     wall.stiffness = stiffness
     ratio = wall.damping_ratio * (1.0 + wall.doubt)
     wall.damping = damping_of_ratio(wall.asked_damping, ratio, stiffness, wall.mass)
+
+
+@compiled
+def _rise(wall: Record, stiffness: float, most: float) -> float:
+    """Return by how much the stiffness may rise in a period, up to the most allowed.
+
+    A spring that becomes stiffer under load gains ΔK·y²/2, with which it would throw the handle. So
+    it gains about what the damper takes, B·v²·T.
+    """
+    if wall.y_sample >= 0.0:
+        return _RISE_OUTSIDE * stiffness
+    rise = _RISE_INSIDE * stiffness
+    if wall.y >= 0.0:
+        return rise
+    taken = wall.damping * wall.v**2 * wall.period
+    return min(rise, _ADDED * taken / (0.5 * wall.y**2) + _RISE_AT_REST * most)
 
 
 @compiled

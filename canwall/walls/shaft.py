@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 _RESONANCES, _MASSES = (0.95, 1.0, 1.05), (0.6, 1.0, 1.7)
 #: Part of the stiffness at the limit of stability, and of that of the shaft: what a contact excites
 #: has to die away, and a heavy hand bounces on the shaft of a wall that is as stiff.
-_MARGIN, _SHAFT_PART = 0.125, 0.25
+_MARGIN, _SHAFT_PART = 0.0625, 0.125
 #: Walls that are looked at, as K·T²/m.
 _LOOKED_AT: Array = np.geomspace(1e-4, 1.25, 100)
 
@@ -82,8 +82,8 @@ class WallLoop(NamedTuple):
 def stiffest_wall(shaft: ElasticShaft, loop: WallLoop) -> float:
     """Return the stiffness up to which a wall leaves the resonance of its shaft alone [N·m/rad].
 
-    It is an eighth of that up to which the loop is stable with a resonance 5 % off and a hand
-    lighter or heavier than the model's, 0 where there is none, and at most a quarter of the
+    It is a sixteenth of that up to which the loop is stable with a resonance 5 % off and a hand
+    lighter or heavier than the model's, 0 where there is none, and at most an eighth of the
     shaft's.
     """
     walls: Array = _LOOKED_AT * loop.mass / loop.period**2
