@@ -16,7 +16,7 @@ class UntellingDataError(RunFailedError):
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value and half of its 95 % interval; the half is inf for what the data do not tell."""
+    """A value and half of its 95 % interval."""
 
     value: float
     half: float

@@ -25,12 +25,14 @@ _TRAVEL, _SPEED, _TORQUE = 0.8, 0.5, 0.5
 _OMEGA, _DAMPING_RATIO = 25.0, 0.7
 #: Time in which the reference gets from rest to its speed, and time of the fastest sweep [s].
 _REVERSAL_S, _FASTEST_SWEEP_S = 0.15, 0.25
+#: Longest period of the SYNC, of which the shortest of these times has some [s].
+SLOWEST_SYNC_S = 0.05
 #: Speeds of the sweeps as parts of the largest one, and seconds for each.
 _SWEEPS = ((1.0, 10.0), (0.5, 9.0), (0.2, 8.0), (0.07, 6.0))
 #: Change of the speed by the signal on top, as a part of that of the sweep.
 _RIPPLE = 0.3
-#: Part of the signal on top that a rotor at the end of an elastic shaft bears, with which a sweep
-#: begins, and factors a cycle by which it grows and shrinks.
+#: Part of the signal on top that a rotor at the end of an elastic shaft bears, with which the
+#: first sweep begins, and factors a cycle by which it grows and shrinks.
 _FIRST_GAIN, _GROWS, _SHRINKS = 0.05, 1.004, 0.99
 #: Largest torque of the signal on top, as a part of the largest one.
 _ON_TOP = 0.7

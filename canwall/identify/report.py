@@ -241,6 +241,8 @@ def json_content(found: Identified) -> dict[str, Any]:
     parts = dict(vars(source))
     if found.servo is not None and found.servo.shaft is not None:
         parts |= {f"shaft_{name}": value for name, value in vars(found.servo.shaft).items()}
+    if found.stiction is not None:
+        parts["stiction"] = found.stiction
     for name, value in parts.items():
         if isinstance(value, Estimate):
             content[name] = {"value": value.value, "interval": [value.low, value.high]}
@@ -257,7 +259,7 @@ def json_content(found: Identified) -> dict[str, Any]:
 
 
 def draw(found: Identified, path: Path) -> None:
-    """Draw measured and modelled motion, what is left, cogging and break-away torques."""
+    """Draw measured and modelled motion, what is left, cogging, and the whole record."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canwall.config import ConfigError, Settings
-from canwall.cycle import ExperimentError, WallAxis
+from canwall.cycle import ExperimentError, WallAxis, torques_in_force
 from canwall.identify.break_away import break_away
 from canwall.identify.estimates import Estimate, ServoFit, UntellingDataError
-from canwall.identify.excitation import Excitation, HandExcitation
+from canwall.identify.excitation import SLOWEST_SYNC_S, Excitation, HandExcitation
 from canwall.identify.fit import fit_servo
 from canwall.identify.hand import HandFit, fit_hand
 from canwall.identify.pieces import encoder_step
@@ -104,15 +104,12 @@ class Identification:
         )
 
     def _stand_still(self, cycles: int) -> None:
-        """Insert SYNCs that the master left out: the torque that was in force stayed in force."""
-        position, torque, actual, counts = self._rows[-1]
-        held = torque
-        if self._axis.setup.synchronous and len(self._rows) > 1:
-            # The last torque has waited for the next SYNC.
-            held = self._rows[-2][1]
-            self._rows[-1] = (position, held, actual, counts)
-        self._rows += [(np.nan, held, actual, counts)] * (cycles - 1)
-        self._rows.append((np.nan, torque, actual, counts))
+        """Insert SYNCs that the master left out."""
+        commanded = [row[1] for row in self._rows[-2:]]
+        first, *others = torques_in_force(commanded, cycles, self._axis.setup.synchronous)
+        position, _, actual, counts = self._rows[-1]
+        self._rows[-1] = (position, first, actual, counts)
+        self._rows += [(np.nan, torque, actual, counts) for torque in others]
 
     def conclude(self) -> None:
         """Leave the fit to the time when the drive is disabled."""
@@ -153,8 +150,10 @@ def identify(
 
     Raises:
         UntellingDataError: If the data do not tell.
+        ConfigError: For a SYNC too slow for it, or a hand to be found with an unknown delay.
         Exception: What `run` raises.
     """
+    _refuse(settings, with_hand)
     made: list[Identification] = []
 
     def experiment(axis: WallAxis) -> Identification:
@@ -228,6 +227,21 @@ def stiction(measured: Measured, servo: ServoFit) -> Estimate | None:
     value = float(np.mean([way.mean() for way in ways if len(way)]))
     scatter = 2.0 * float(holds.std(ddof=1)) / np.sqrt(len(holds))
     return Estimate(value, float(np.hypot(scatter, error.mean())))
+
+
+def _refuse(settings: Settings, with_hand: bool) -> None:
+    """Raise ConfigError for a configuration with which nothing can be identified."""
+    if settings.bus.cycle_s > SLOWEST_SYNC_S:
+        raise ConfigError(
+            f"bus.cycle_s: has to be at most {SLOWEST_SYNC_S:g} to identify anything, "
+            f"not {settings.bus.cycle_s:g}"
+        )
+    known = settings.drive.torque_pdo == "sync" or settings.estimator.delay_cycles is not None
+    if with_hand and not known:
+        raise ConfigError(
+            "estimator.delay_cycles: needed for --hand where a torque acts on reception; "
+            "`canwall identify` without a hand finds it"
+        )
 
 
 def _without_wall(settings: Settings, duration_s: float) -> Settings:
