@@ -3,7 +3,7 @@
 from canwall.cycle.axis import Offer, WallAxis, WallStage
 from canwall.cycle.bus_monitor import BusMonitor
 from canwall.cycle.exchange import Exchange, SyncLostError
-from canwall.cycle.experiment import Experiment, ExperimentError
+from canwall.cycle.experiment import Experiment, ExperimentError, torques_in_force
 from canwall.cycle.laws import law_of, named_law, run_laws, with_law
 from canwall.cycle.loop import Loop, WallGivenUpError
 from canwall.cycle.machine import real_time_machine
@@ -71,5 +71,6 @@ __all__ = [
     "step",
     "stiffest_for",
     "timing_summary",
+    "torques_in_force",
     "with_law",
 ]

@@ -24,7 +24,7 @@ from scipy.optimize import least_squares
 from canwall.compiled import Record, compiled
 from canwall.config import Mechanics
 from canwall.cycle.axis import WallAxis
-from canwall.cycle.experiment import ExperimentError
+from canwall.cycle.experiment import ExperimentError, torques_in_force
 from canwall.cycle.state import set_delay
 from canwall.physics import advance, make_plant
 from canwall.walls import MAX_DELAY
@@ -79,6 +79,7 @@ class DelayTest:
             self._torques[part] = amplitude * excitation(cycles, length, _SEED + k)
         self._positions: list[float] = []
         self._forces: list[float] = []
+        self._skipped = int(axis.cycle["skipped_sync"][0])
         self._fit: Future[Delay] | None = None
         if settings.real_time:
             self._thread = ThreadPoolExecutor(1)
@@ -103,8 +104,14 @@ class DelayTest:
 
     def note(self) -> None:
         """Store position and torque of the last cycle."""
-        if len(self._positions) == self.cycles:
+        left_out = int(self.axis.cycle["skipped_sync"][0]) - self._skipped
+        self._skipped += left_out
+        if len(self._positions) >= self.cycles:
             return
+        if left_out and self._forces:
+            synchronous = self.axis.setup.synchronous
+            self._forces[-1:] = torques_in_force(self._forces, left_out, synchronous)
+            self._positions += [math.nan] * left_out
         row = self.axis.row[0]
         self._positions.append(float(row["position_rad"]) if row["received"] else math.nan)
         self._forces.append(float(row["torque_cmd"]))

@@ -1,5 +1,6 @@
 """Experiments: what a loop does with an enabled drive besides rendering its wall."""
 
+from collections.abc import Sequence
 from typing import Protocol
 
 from canwall.cycle.axis import WallAxis
@@ -26,6 +27,23 @@ class Experiment(Protocol):
     def conclude(self) -> None:
         """Conclude, with the drive still enabled. Raises ExperimentError."""
         ...
+
+
+def torques_in_force(last: Sequence[float], left_out: int, synchronous: bool) -> list[float]:
+    """Return the torques in force from the last cycle noted up to the end of a gap.
+
+    In the SYNCs that the master left out, the torque that was in force stayed in force.
+
+    Args:
+        last: Torques commanded in the last cycles, the latest one last; at least one.
+        left_out: SYNCs that were left out, at least one.
+        synchronous: True if a torque waits for the next SYNC.
+
+    Returns:
+        Torques of the last cycle and of those left out, 1 + left_out of them.
+    """
+    held = last[-2] if synchronous and len(last) > 1 else last[-1]
+    return [held] * left_out + [last[-1]]
 
 
 class ExperimentError(RunFailedError):

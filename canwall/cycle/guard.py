@@ -38,8 +38,8 @@ STEADY_BLOCKS, STEADY = 5, 0.6
 #: ... or for this many, with this of the largest peak in each; swings in all of them.
 LASTING_BLOCKS, LASTING = 10, 0.5
 STEADY_SWINGS, LASTING_SWINGS = 12, 8
-#: Energy given off in a contact over that taken in; speed out over speed in, and as long as the
-#: force is lowered.
+#: Energy given off in a contact beyond that taken in, over the latter; speed out over speed in, and
+#: as long as the force is lowered.
 GAIN, FASTER, AGAIN = 0.2, 1.1, 0.8
 #: Longest contact whose speeds on entry and leaving have to do with each other [s], and least way
 #: within the span before one that counts [counts].
@@ -204,7 +204,9 @@ def watch(
         guard.first_alarm = j
     guard.alarms += 1
     guard.held = 0
+    # The next block begins here, with the force as it is from now on.
     guard.filled = 0
+    guard.peak = guard.squares = guard.swung = 0.0
     if guard.action == _ACT:
         guard.factor = max(LEAST, left * guard.factor)
         guard.lowest = min(guard.lowest, guard.factor)

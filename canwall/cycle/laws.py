@@ -5,7 +5,7 @@ from typing import Any
 
 from canwall.config import ConfigError, Settings, Wall, absolute_law
 from canwall.cycle.state import MAX_LAWS
-from canwall.walls import DEADBEAT, Law, UnknownLawError, find_law
+from canwall.walls import DEADBEAT, Law, UnknownLawError, find_law, law_name
 
 
 def law_of(wall: Wall) -> Law:
@@ -53,4 +53,4 @@ def with_law(settings: Settings, law: str) -> Settings:
 
 def named_law(settings: Settings) -> str:
     """Return the configured law as `with_law` takes it."""
-    return settings.wall.law + (DEADBEAT if settings.wall.deadbeat else "")
+    return law_name(settings.wall.law, settings.wall.deadbeat)

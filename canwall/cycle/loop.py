@@ -182,12 +182,17 @@ class Loop:
             start_at(axis.cycle, int(axis.cycle["counts"][0]))
 
     def render(self, cycles: int | None) -> bool:
-        """Render the walls for the given cycles; return True if stopped before their end.
+        """Render the walls up to the given cycle of the run; return True if stopped before.
 
-        Raises WallGivenUpError at a trip.
+        Raises WallGivenUpError at a trip, or if nothing is left for the walls.
         """
         if self.measure(self._delay_tests):
             return True
+        if cycles is not None and self.j >= cycles:
+            raise WallGivenUpError(
+                f"run.duration_s was over before the wall began: enabling and measuring the delay "
+                f"took {self.j * self._period:.3g} s; make it longer"
+            )
         for axis in self._axes:
             # The handle may be inside the wall, so the force fades in.
             fade_in(axis.cycle, round(axis.settings.run.ramp_in_s / self._period))

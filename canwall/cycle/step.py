@@ -141,7 +141,9 @@ def _identify_operator(cycle: Record, sample: float) -> None:
         change_plant(wall, estimator.mass, estimator.viscous)
         wall.stiffest = stiffest(bank)
         if cycle.fade_left > 0:
-            change_plant(cycle.faded[0].wall[0], estimator.mass, estimator.viscous)
+            faded = cycle.faded[0].wall[0]
+            change_plant(faded, estimator.mass, estimator.viscous)
+            faded.stiffest = min(faded.stiffest, wall.stiffest)
         if cycle.compares_lag and not cycle.keeps_mass:
             take_over(bank, cycle.lagging[0])
             take_over(bank, cycle.losing[0])

@@ -118,10 +118,10 @@ def _settings(settings: Settings, request: Start) -> Settings:
     raw = settings.model_dump()
     if settings.embedded:
         from canwall.cycle.state import MAX_LAWS
-        from canwall.walls import DEADBEAT, LAWS
+        from canwall.walls import DEADBEAT, LAWS, law_name
 
         known = {
-            wall.law + (DEADBEAT if wall.deadbeat else ""): None
+            law_name(wall.law, wall.deadbeat): None
             for stage in settings.stages
             for wall in settings.laws_in_turn(stage.wall)
         }

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from canwall.config import ConfigError, Wall, WallChange, absolute_law, first_error
 from canwall.record.live import LiveLaw
 from canwall.run.changes import not_of_the_run
-from canwall.walls import DEADBEAT, UnknownLawError, refuse_other_options
+from canwall.walls import UnknownLawError, law_name, refuse_other_options
 
 #: Keys that one change may give instead of another.
 _DAMPING = {"damping_nm_s_per_rad", "damping_ratio"}
@@ -35,7 +35,7 @@ def check_laws(changes: Sequence[WallChange], wall: Wall, laws: Sequence[LiveLaw
     """
     options = {law.name: [option.name for option in law.options] for law in laws}
     for change in changes:
-        name = wall.law + (DEADBEAT if wall.deadbeat else "")
+        name = law_name(wall.law, wall.deadbeat)
         if change.law is not None:
             name = absolute_law(change.law, Path())
         if name not in options:

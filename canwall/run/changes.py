@@ -44,7 +44,7 @@ from canwall.record import RecordError, RunFolder
 from canwall.record.folder import reason
 from canwall.record.live import LiveMemory, LiveRun
 from canwall.run.publishing import Publisher
-from canwall.walls import DEADBEAT, UnknownLawError, find_law
+from canwall.walls import UnknownLawError, find_law, law_name
 
 #: Longest wait for the loop to take a change; it takes one at a time [s].
 _PATIENCE_S = 5.0
@@ -298,7 +298,7 @@ def _check_lower(limits: Limits, in_force: Limits) -> None:
 def _check_law(axis: WallAxis, wall: Wall) -> None:
     """Raise ConfigError unless the law is one of the run's and has the options of the wall."""
     known = {law.name: law for law in axis.laws}
-    name = wall.law + (DEADBEAT if wall.deadbeat else "")
+    name = law_name(wall.law, wall.deadbeat)
     try:
         if name not in known and ":" not in name:
             find_law(wall.law, wall.deadbeat)  # says what is wrong with the name

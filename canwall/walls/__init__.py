@@ -61,7 +61,7 @@ from canwall.walls.interface import (
 from canwall.walls.latch import LATCH, age_at, at_sync, expect_torques, reset_latch, set_latch
 from canwall.walls.layers import TENSION, set_applied_force, wall_force
 from canwall.walls.probe import is_probe_in_flight, other_torque_acts
-from canwall.walls.registry import LAWS, declare_law, find_law, is_declared
+from canwall.walls.registry import LAWS, declare_law, find_law, is_declared, law_name
 from canwall.walls.shaft import ElasticShaft, WallLoop, stiffest_wall
 
 __all__ = [
@@ -101,6 +101,7 @@ __all__ = [
     "is_probe_in_flight",
     "knows_mass",
     "law",
+    "law_name",
     "lightest_bandwidth",
     "likelier",
     "may_lag",

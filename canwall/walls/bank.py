@@ -418,9 +418,8 @@ def _follow(bank: Record, rises: bool) -> bool:
     """
     likeliest, deviation = solve(bank.regression[0], bank.mass, False)
     bank.spread = deviation / max(likeliest, deviation)
-    if likeliest > 0.0:
-        # Rotor and load together.
-        likeliest /= 1.0 + bank.regression[0].rotor * likeliest
+    # Rotor and load together.
+    likeliest /= 1.0 + bank.regression[0].rotor * likeliest
     step = _FOLLOWED * (_place_of(bank, likeliest) - bank.place)
     if bank.spread < _FOUND_SPREAD:
         bank.known = True
@@ -448,8 +447,6 @@ def _mass_at(bank: Record, place: float) -> float:
 @compiled
 def _place_of(bank: Record, likeliest: float) -> float:
     """Return the place of the mass 1/likeliest among the filters."""
-    if likeliest <= 0.0:
-        return bank.count - 1.0
     place = (-math.log(likeliest) - bank.log_lightest) / bank.log_step
     return min(max(place, 0.0), bank.count - 1.0)
 

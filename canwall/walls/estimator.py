@@ -89,7 +89,7 @@ class KalmanModel(NamedTuple):
     scale: NDArray[np.float64]
 
 
-@functools.lru_cache(maxsize=1024)  # a bank has two a filter, and a sweep sets it for each strike
+@functools.lru_cache(maxsize=1024)  # a bank has up to six a filter; a sweep sets it often
 def kalman_model(
     mass: float, viscous: float, spring: float, period: float, count: float, force_walk: float
 ) -> KalmanModel:
@@ -185,7 +185,9 @@ def set_estimator(
         raise ValueError(f"a delay of {delay:g} periods is not between 0 and {MAX_DELAY}")
     whole = math.floor(delay)
     fraction = delay - whole
-    estimator["delay_periods"], estimator["told"] = whole, delay - margin
+    estimator["delay_periods"] = whole
+    # (1 + 0.15) − 0.15 is less than 1, and its whole part counts.
+    estimator["told"] = round(delay - margin, 9)
     estimator["mass"], estimator["viscous"] = mass, viscous
     estimator["coulomb"] = coulomb
     kalman = kalman_model(mass, viscous, spring, period, count, force_walk)

@@ -22,5 +22,7 @@ def exponential(wall: Record) -> float:
     if wall.y_sample >= 0.0:
         return 0.0
     length = wall.options.length
+    if not length > 0.0:
+        return math.nan  # no wall: the run ends, and says that the law returned no number
     depth = min(-wall.y_sample / length, _LARGEST_EXPONENT)
     return wall.stiffness * length * math.expm1(depth)

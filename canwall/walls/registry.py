@@ -76,13 +76,17 @@ def is_declared(name: str) -> bool:
     return name in _user_laws and ":" not in name
 
 
+def law_name(law: str, deadbeat: bool) -> str:
+    """Return the name of a law, with `+deadbeat` for the compensation."""
+    return law + DEADBEAT if deadbeat and not law.endswith(DEADBEAT) else law
+
+
 def find_law(name: str, deadbeat: bool = False) -> Law:
     """Return the law of that name, declared or of that `file.py:function`.
 
     Raises UnknownLawError.
     """
-    if deadbeat:
-        name += DEADBEAT
+    name = law_name(name, deadbeat)
     if name in LAWS:
         return LAWS[name]
     bare = name.removesuffix(DEADBEAT)
