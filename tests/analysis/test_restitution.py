@@ -126,8 +126,9 @@ def test_a_rotor_that_swings_on_its_shaft_does_not_kick() -> None:
     """The handle leaves half as fast as it came; the rotor swings about it, in four samples."""
     assert [swing_samples(hz, 1e-3) for hz in (0.0, 250.0, 400.0, 2500.0)] == [1, 4, 3, 1]
     y = bounces((1.0, 0.5), samples=30)
+    left = np.arange(len(y)) > 30
     swing = 0.7 * np.sin(0.5 * np.pi * np.arange(len(y)) + 0.25 * np.pi)
-    swung = np.where(np.arange(len(y)) > 30, y + swing, y)
+    swung = np.where(left, y + swing, y)
     assert kicks(swung, HELD, 1e-6, 1)
     assert not kicks(swung, HELD, 1e-6, 4)
-    assert kicks(np.where(swung > 0.0, 2.5 * swung, swung), HELD, 1e-6, 4)
+    assert kicks(np.where(left, 2.5 * y + swing, y), HELD, 1e-6, 4)

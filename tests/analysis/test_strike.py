@@ -154,6 +154,7 @@ def kicked(restitution: float) -> Array:
         ("amplitude", pressed() + sine(0.002, 25.0), {}, 0.002, 25.0),
         ("kick", kicked(1.3), {}, 0.0, 0.0),
         ("", kicked(1.05), {}, 0.0, 0.0),
+        ("", pressed(exit_speed=3.0), {}, 0.0, 0.0),  # the hand takes it out
         ("ripple", pressed() + sine(COUNT, 25.0), {"felt": sine(0.02, 100.0)}, COUNT, 100.0),
         ("thrown", pressed(), {"thrown": True}, 0.0, 0.0),
         # Where nothing settles it is the motion in contact.

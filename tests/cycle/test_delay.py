@@ -193,6 +193,27 @@ def test_loop_measures_the_delay_that_the_drive_was_given(
     assert np.ptp(measuring["position_rad"]) < 0.05
 
 
+def test_run_that_is_over_before_its_wall_says_so(make_rig: RigFactory) -> None:
+    settings = settings_with({"estimator.measure_delay": True})
+    (trip,) = Loop(make_rig(with_hand_at_rest(settings))).run(500).trips
+    assert "run.duration_s was over before the wall began" in trip
+    assert "took 0.8" in trip
+
+
+def test_syncs_that_were_left_out_are_in_the_record(make_rig: RigFactory) -> None:
+    """The torque in force stayed in force, and the positions are not known."""
+    test = DelayTest(Loop(make_rig(settings_with({"estimator.measure_delay": True}))).axis)
+    row, cycle = test.axis.row, test.axis.cycle
+    row["received"] = True
+    for j, torque in enumerate((1.0, 2.0, 3.0)):
+        cycle["skipped_sync"] += 2 if j == 2 else 0
+        row["position_rad"], row["torque_cmd"] = 0.1 * j, torque
+        test.excite()
+        test.note()
+    np.testing.assert_allclose(test._positions, [0.0, 0.1, np.nan, np.nan, 0.2])
+    assert test._forces == [1.0, 1.0, 1.0, 2.0, 3.0]
+
+
 @pytest.mark.parametrize(("first_s", "told"), [(0.2, True), (2.0, False)])
 def test_strike_during_the_measurement_is_told(
     make_rig: RigFactory, first_s: float, told: bool

@@ -124,6 +124,19 @@ def test_contact_that_feeds_the_handle(restitution: float, alarms: int) -> None:
         assert record["first_alarm"][0] <= 60 + 40 + 10
 
 
+def test_block_after_an_alarm_begins_with_it() -> None:
+    """What the force was before it was lowered does not count against it."""
+    record = made()
+    y, force = bounce(2.0)
+    watched(record, y, force)
+    alarm = int(record["first_alarm"][0])
+    assert (alarm + 1) % int(record["block"][0]) != 0, "in the middle of a block"
+    record = made()
+    watched(record, y[: alarm + 1], force[: alarm + 1])
+    assert record["alarms"][0] == 1
+    assert [float(record[name][0]) for name in ("peak", "squares", "swung")] == [0.0, 0.0, 0.0]
+
+
 def test_force_returns_slowly() -> None:
     record = made()
     watched(record, *bounce(2.0))

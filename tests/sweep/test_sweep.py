@@ -23,6 +23,7 @@ from rig import settings_with
 
 from canwall import cli
 from canwall.analysis.k_limit import FINE_FACTOR
+from canwall.config import ConfigError
 from canwall.errors import InputError
 from canwall.sweep import Plan, ineffective_axis_notes, make_plan, read_sweep, sweep, sweep_table
 from canwall.sweep.axes import settings_at
@@ -54,6 +55,13 @@ def raw(plan: Plan) -> list[bytes]:
         {"wall.side": ["below", "above"], "wall.position_rad": [0.02]},
         {"simulation.hand.grip": [False], "operator": ["finger"], "servo": ["ideal"]},
         {"model": ["drive"], "model_error": [-0.2, 0.3], "law": "push_only", "speed": [0.5, 2.0]},
+        # The bound that a shaft sets depends on the damping.
+        {
+            "servo": "1600Hz",
+            "simulation.shaft_hz": [400.0],
+            "model": "drive",
+            "damping": [0.0, 0.02],
+        },
     ],
     ids=lambda axes: ", ".join(axes),
 )
@@ -161,6 +169,21 @@ def test_referent_is_the_wall_in_force_for_the_mass_that_moves() -> None:
     assert found["stiffness_in_force"] == found["stiffness_in_force_least"]
     assert found["stiffness_in_force"] == pytest.approx(50.0)
     assert referent["stiffness_in_force"] == pytest.approx(stiffness)
+
+
+def test_cap_of_a_law_that_is_evaluated_every_few_periods_is_that_of_its_period() -> None:
+    struck: dict[str, object] = {"operator": ["grip"], "law": ["mean_force"], "model": ["drive"]}
+    divided = plan_of(**struck, stiffness=[600.0], **{"wall.cap": [0.8], "wall.divider": [4]})
+    plain = plan_of(**struck, stiffness=[600.0], **{"wall.cap": [0.05]})
+    found, alike = (compute_piece(plan, 0)[0, 0] for plan in (divided, plain))
+    assert found["referent_first_depth"] == alike["referent_first_depth"]
+
+
+def test_model_lighter_than_its_rotor_is_refused() -> None:
+    axes = {"servo": ["1600Hz"], "model": ["drive"], "simulation.shaft_hz": [400.0]}
+    plan_of(**axes, model_error=[-0.8])
+    with pytest.raises(ConfigError, match=r"model_error: with -0\.9 the model's inertia"):
+        plan_of(**axes, model_error=[-0.9])
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from canwall.walls import (
     predict,
     reset_estimator,
     set_estimator,
+    stand_still,
 )
 from canwall.walls.estimator import kalman_model
 
@@ -353,3 +354,16 @@ def test_reset_clears_state_and_forces_in_flight() -> None:
 def test_a_delay_out_of_range_is_refused(delay: float) -> None:
     with pytest.raises(ValueError, match=r"delay of .* is not between 0 and 3"):
         make_estimator(MODELS[0], delay)
+
+
+@pytest.mark.parametrize("margin", [0.05, 0.1, 0.15, 0.3, 0.4, 0.8, 0.9])
+@pytest.mark.parametrize("delay", [1.0, 2.0])
+def test_torque_in_force_while_the_master_stands_still_is_that_of_the_delay(
+    delay: float, margin: float
+) -> None:
+    """(1 + 0.15) − 0.15 is less than 1."""
+    estimator = make_estimator(MODELS[0], delay)
+    set_estimator(estimator, 1.0, 0.0, 0.0, 0.0, PERIOD, COUNT, WALK, delay + margin, margin)
+    estimator["in_flight"][0, :4] = [1.0, 2.0, 3.0, 4.0]
+    stand_still(estimator[0], 1)
+    assert estimator["v"][0] == pytest.approx((1.0 + delay) * PERIOD)

@@ -65,6 +65,10 @@ def test_deadbeat_is_an_option_of_some_laws(law: str) -> None:
     )
 
 
+def test_compensation_that_is_in_the_name_is_not_added_again() -> None:
+    assert find_law("half_sample" + DEADBEAT, deadbeat=True) is LAWS["half_sample" + DEADBEAT]
+
+
 @pytest.mark.parametrize("name", ["Standard", "half-sample", "", "deadbeat"])
 @pytest.mark.parametrize("deadbeat", [False, True])
 def test_unknown_law(name: str, deadbeat: bool) -> None:

@@ -73,6 +73,13 @@ def test_stiffness_and_damping_can_change_at_any_sample() -> None:
     assert force_at_sample(wall, "damped", -0.1, 1.0) == pytest.approx(0.3 * K - 0.5 * B)
 
 
+@pytest.mark.parametrize("length", [0.0, -0.02, math.nan])
+def test_exponential_spring_without_a_length_is_no_number(length: float) -> None:
+    """It ends the run; a force of zero would be a wall that is not there."""
+    wall = wall_of(Ball(stiffness=K), "exponential", length=length)
+    assert math.isnan(force_at_sample(wall, "exponential", -0.01, -1.0))
+
+
 def test_exponential_spring_ends_in_a_finite_force() -> None:
     """Beyond e⁵⁰ the exponential is clipped, so that no double overflows."""
     wall = wall_of(Ball(stiffness=K), "exponential")
