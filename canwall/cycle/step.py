@@ -387,6 +387,46 @@ def _end_lag(cycle: Record) -> None:
 
 
 @compiled
+def _fill_row(cycle: Record, row: Record, received: bool, demanded: float, applied: float) -> None:
+    """Fill the row of this cycle.
+
+    demanded: force of the law, without the probe [N·m]. applied: force in force, with it [N·m].
+    """
+    rendered, estimator = cycle.rendered[0], cycle.estimator[0]
+    wall = rendered.wall[0]
+    row.j = cycle.j
+    row.t_s = cycle.j * cycle.period
+    row.phase = cycle.phase
+    row.received = received
+    row.counts = cycle.counts
+    row.statusword = cycle.statusword
+    row.controlword = cycle.controlword
+    row.position_rad = cycle.counts * cycle.rad_per_count
+    row.y = wall.y_sample
+    # To the estimator the first position of all is a jump.
+    row.y_est = wall.y if cycle.started else wall.y_sample
+    row.v_est = wall.v if cycle.started else 0.0
+    row.d_est = wall.d if cycle.started else 0.0
+    row.force = demanded
+    row.torque_cmd_per_mille = cycle.torque_per_mille
+    row.torque_cmd = cycle.torque_per_mille * cycle.nm_per_mille
+    row.torque_applied = cycle.orientation * applied
+    row.torque_actual = cycle.torque_actual * cycle.nm_per_mille
+    row.force_applied = cycle.force_applied
+    row.law = rendered.law
+    row.stiffness = wall.asked_stiffness
+    row.damping = wall.damping
+    row.damping_ratio = wall.damping_ratio
+    row.cap = wall.cap
+    row.stiffness_in_force = cycle.share * cycle.guard[0].factor * wall.stiffness
+    row.mass_est = estimator.mass
+    row.mass_spread = cycle.bank[0].spread
+    row.delay_est = estimator.told + cycle.bank[0].regression[0].excess
+    row.wall_position_rad = rendered.position
+    row.guard = cycle.guard[0].factor
+
+
+@compiled
 def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: bool) -> int:
     """Return RPDO data for TPDO data (little-endian numbers), and fill the row of this cycle.
 
@@ -394,7 +434,6 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     data is ignored.
     """
     cycle: Record = cycles[0]
-    row: Record = rows[0]
     rendered = cycle.rendered[0]
     wall = rendered.wall[0]
     estimator = cycle.estimator[0]
@@ -447,8 +486,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     demanded = 0.0 if cycle.bank[0].probe[0].acts else force
     limit = _torque_limit(cycle)
     per_mille = to_per_mille(cycle.orientation * force, cycle.nm_per_mille, limit)
-    torque = per_mille * cycle.nm_per_mille
-    sent = cycle.orientation * torque
+    sent = cycle.orientation * per_mille * cycle.nm_per_mille
     if cycle.frozen and cycle.frozen < cycle.stuck_cycles:
         predict_open_loop(estimator, sent)
     excess = cycle.bank[0].regression[0].excess
@@ -473,36 +511,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
         set_applied_force(cycle.faded[0].wall[0], sent - probes[0])
     cycle.torque_per_mille = per_mille
 
-    row.j = cycle.j
-    row.t_s = cycle.j * cycle.period
-    row.phase = cycle.phase
-    row.received = received
-    row.counts = cycle.counts
-    row.statusword = cycle.statusword
-    row.controlword = cycle.controlword
-    row.position_rad = cycle.counts * cycle.rad_per_count
-    row.y = wall.y_sample
-    # To the estimator the first position of all is a jump.
-    row.y_est = wall.y if cycle.started else wall.y_sample
-    row.v_est = wall.v if cycle.started else 0.0
-    row.d_est = wall.d if cycle.started else 0.0
-    row.force = demanded
-    row.torque_cmd_per_mille = per_mille
-    row.torque_cmd = torque
-    row.torque_applied = cycle.orientation * applied
-    row.torque_actual = cycle.torque_actual * cycle.nm_per_mille
-    row.force_applied = cycle.force_applied
-    row.law = rendered.law
-    row.stiffness = wall.asked_stiffness
-    row.damping = wall.damping
-    row.damping_ratio = wall.damping_ratio
-    row.cap = wall.cap
-    row.stiffness_in_force = cycle.share * cycle.guard[0].factor * wall.stiffness
-    row.mass_est = estimator.mass
-    row.mass_spread = cycle.bank[0].spread
-    row.delay_est = estimator.told + cycle.bank[0].regression[0].excess
-    row.wall_position_rad = rendered.position
-    row.guard = cycle.guard[0].factor
+    _fill_row(cycle, rows[0], received, demanded, applied)
     cycle.j += 1
     return _placed(cycle.controlword, cycle.out_controlword[0]) | _placed(
         per_mille, cycle.out_torque[0]

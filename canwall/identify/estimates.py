@@ -1,6 +1,7 @@
 """Results of an identification: estimates with their intervals, and a servo made of them."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +9,27 @@ from numpy.typing import NDArray
 from canwall.errors import RunFailedError
 
 Array = NDArray[np.float64]
+
+#: Parts of a record whose errors count as independent, and the factor from a standard error to half
+#: a 95 % interval: Student's t with one degree of freedom fewer.
+PARTS, T_95 = 16, 2.131
+
+
+def covariance_by_parts(bread: NDArray[np.floating[Any]], scores: Array) -> Array:
+    """Return the covariance of a least-squares fit whose errors are correlated within parts.
+
+    The cluster-robust estimate, bread · Σ sₖ·sₖᵀ · bread, with sₖ the sum of a part's scores.
+
+    Args:
+        bread: Inverse of JᵀJ, shape (n, n).
+        scores: Products Jᵀ·residual of some samples each, in the order of time, shape (m, n).
+
+    Returns:
+        Covariance, shape (n, n).
+    """
+    sums = np.stack([part.sum(axis=0) for part in np.array_split(scores, PARTS)])
+    covariance: Array = bread @ (sums.T @ sums) @ bread * (PARTS / (PARTS - 1.0))
+    return covariance
 
 
 class UntellingDataError(RunFailedError):

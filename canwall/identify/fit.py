@@ -19,7 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from canwall.identify.estimates import Estimate, Residuals, ServoFit, Shaft, UntellingDataError
+from canwall.identify.estimates import (
+    T_95,
+    Estimate,
+    Residuals,
+    ServoFit,
+    Shaft,
+    UntellingDataError,
+    covariance_by_parts,
+)
 from canwall.identify.pieces import PIECE, Pieces, steady_pieces
 
 Array = NDArray[np.float64]
@@ -32,9 +40,6 @@ _COG_GRID_RAD, _COG_PRIOR = 0.025, 0.02
 #: Pieces whose residuals are this many times the median are left out: the drive's clock slips by a
 #: tick of its own now and then, and nothing in the model does.
 _OUTLIER = 5.0
-#: Parts of the record whose errors count as independent, and the factor from a standard error to
-#: half a 95 % interval: Student's t with one degree of freedom fewer.
-_BLOCKS, _T_95 = 16, 2.131
 #: Share of the residuals that a shaft has to explain, and its coefficient in standard errors.
 _SHAFT_EXPLAINS, _SHAFT_SIGNIFICANCE = 0.03, 6.0
 #: Share of the motion that may be neither explained nor the encoder's noise, and largest relative
@@ -263,7 +268,7 @@ class _Fit:
         """Return linear parameters, covariance of (non-linear, linear) ones, residuals [steps].
 
         The linear ones are (1, ρ, b, c₊, c₋)/m, without ρ for a rigid shaft. Residuals may be
-        correlated in any way within each of _BLOCKS parts of the record, which differ in speed and
+        correlated in any way within each of PARTS parts of the record, which differ in speed and
         signal (a cluster-robust estimate, Liang and Zeger 1986).
         """
         basis = self._basis[:, : self._points]
@@ -286,10 +291,7 @@ class _Fit:
         bread = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-13, hermitian=True)
         samples = self._measured.size
         scores = (jacobian[:samples] * left[:samples, None]).reshape(-1, PIECE, jacobian.shape[1])
-        blocks = np.array_split(scores.sum(axis=1), _BLOCKS)
-        sums = np.stack([block.sum(axis=0) for block in blocks])
-        meat = sums.T @ sums * _BLOCKS / (_BLOCKS - 1.0)
-        covariance = bread @ meat @ bread
+        covariance = covariance_by_parts(bread, scores.sum(axis=1))
         return linear, covariance / np.outer(scale, scale), left[:samples]
 
     def viscous(self, x: Array) -> float:
@@ -320,7 +322,7 @@ class _Fit:
                 up[i], down[i] = value + h, value - h
                 slope[i] = (of(up) - of(down)) / (2.0 * h)
             value = of(everything)
-            statistical = _T_95 * math.sqrt(max(float(slope @ covariance @ slope), 0.0))
+            statistical = T_95 * math.sqrt(max(float(slope @ covariance @ slope), 0.0))
             return Estimate(value, math.hypot(statistical, unmodelled * value, least))
 
         shaft = None

@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 
 from canwall.config import Settings
 from canwall.cycle import modelled_delay
-from canwall.identify.estimates import Estimate, UntellingDataError
+from canwall.identify.estimates import (
+    PARTS,
+    T_95,
+    Estimate,
+    UntellingDataError,
+    covariance_by_parts,
+)
 from canwall.identify.pieces import torque_response
 
 Array = NDArray[np.float64]
@@ -25,8 +31,6 @@ Array = NDArray[np.float64]
 _PIECE_S, _ORDER = 0.2, 3
 #: Share of the motion that has to be explained.
 _EXPLAINED = 0.5
-#: Parts of the record whose errors count as independent, and Student's t for a 95 % interval.
-_BLOCKS, _T_95 = 16, 2.131
 
 
 @dataclass(frozen=True)
@@ -69,7 +73,7 @@ def fit_hand(position: Array, torque: Array, period: float, settings: Settings) 
     pieces = len(y) // length
     time = np.linspace(-1.0, 1.0, length)
     basis, _ = np.linalg.qr(np.vander(time, _ORDER + 1))
-    if pieces < 2 * _BLOCKS:
+    if pieces < 2 * PARTS:
         raise UntellingDataError("the record is too short to tell who holds the handle")
 
     def cut(signal: Array) -> Array:
@@ -90,10 +94,9 @@ def fit_hand(position: Array, torque: Array, period: float, settings: Settings) 
         )
     bread = np.linalg.inv(x.T @ x)
     scores = (x * left[:, None]).reshape(pieces, length, 3).sum(axis=1)
-    sums = np.stack([block.sum(axis=0) for block in np.array_split(scores, _BLOCKS)])
-    covariance = bread @ (sums.T @ sums) @ bread * _BLOCKS / (_BLOCKS - 1.0)
+    covariance = covariance_by_parts(bread, scores)
     values = solved / scale
-    halves = _T_95 * np.sqrt(np.diag(covariance)) / scale
+    halves = T_95 * np.sqrt(np.diag(covariance)) / scale
     free = (
         mechanics.inertia_kg_m2,
         mechanics.viscous_nm_s_per_rad,

@@ -261,8 +261,8 @@ def clear_memory(wall: NDArray[np.void]) -> None:
 #: Rise in a period of a stiffness that the mass in force allows again, as a share of itself:
 #: outside the wall, and inside, where the spring is loaded, at most.
 _RISE_OUTSIDE, _RISE_INSIDE = 0.2, 0.03
-#: Energy that a rise inside may add to the loaded spring, over what the damper takes meanwhile; rise
-#: in a period of a wall at rest, where the hand holds against it, as a share of what is allowed.
+#: Energy that a rise inside may add to the loaded spring, over what the damper takes meanwhile;
+#: rise in a period of a wall at rest, against which the hand holds, as a share of what is allowed.
 _ADDED, _RISE_AT_REST = 1.5, 0.001
 #: Share of the stiffness asked for from which it grows, where no wall was allowed before.
 _LEAST_SHARE = 1e-3
