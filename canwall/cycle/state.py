@@ -364,7 +364,7 @@ def _bound_stiffness(cycle: NDArray[np.void]) -> None:
             mass = math.exp(bank["log_lightest"] + i * bank["log_step"])
             gain = tuple(bank["steady_gain"][:, i].tolist())
             loop = WallLoop(mass, bank["viscous"][i].item(), gain, *closing)
-            bank["stiffest"][i] = stiffest_wall(shaft, loop)
+            bank["stiffest"][i] = stiffest_wall(shaft, loop, identified=n > 1)
         if not n:
             known = estimator["mass"].item(), estimator["viscous"].item()
             gain = tuple(estimator["steady_gain"].tolist())

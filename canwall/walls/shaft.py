@@ -21,7 +21,10 @@ Array = NDArray[np.float64]
 _RESONANCES, _MASSES = (0.95, 1.0, 1.05), (0.6, 1.0, 1.7)
 #: Part of the stiffness at the limit of stability, and of that of the shaft: what a contact excites
 #: has to die away, and a heavy hand bounces on the shaft of a wall that is as stiff.
-_MARGIN, _SHAFT_PART = 0.0625, 0.125
+_MARGIN, _SHAFT_PART = 0.125, 0.25
+#: Part of that for a hand that is identified: until it is, its wall has the damping of another one,
+#: and the stiffness changes with the mass.
+_IDENTIFIED = 0.5
 #: Walls that are looked at, as K·T²/m.
 _LOOKED_AT: Array = np.geomspace(1e-4, 1.25, 100)
 
@@ -79,12 +82,12 @@ class WallLoop(NamedTuple):
 
 
 @functools.lru_cache(maxsize=4096)
-def stiffest_wall(shaft: ElasticShaft, loop: WallLoop) -> float:
+def stiffest_wall(shaft: ElasticShaft, loop: WallLoop, identified: bool = False) -> float:
     """Return the stiffness up to which a wall leaves the resonance of its shaft alone [N·m/rad].
 
-    It is a sixteenth of that up to which the loop is stable with a resonance 5 % off and a hand
-    lighter or heavier than the model's, 0 where there is none, and at most an eighth of the
-    shaft's.
+    It is an eighth of that up to which the loop is stable with a resonance 5 % off and a hand
+    lighter or heavier than the model's, 0 where there is none, and at most a quarter of the
+    shaft's; half of either for a hand that is identified.
     """
     walls: Array = _LOOKED_AT * loop.mass / loop.period**2
     stable = len(walls)
@@ -97,7 +100,8 @@ def stiffest_wall(shaft: ElasticShaft, loop: WallLoop) -> float:
             stable = int(unstable[0]) if len(unstable) else stable
             if not stable:
                 return 0.0
-    return min(_MARGIN * float(walls[stable - 1]), _SHAFT_PART * shaft.stiffness)
+    most = min(_MARGIN * float(walls[stable - 1]), _SHAFT_PART * shaft.stiffness)
+    return _IDENTIFIED * most if identified else most
 
 
 def closed_loops(shaft: ElasticShaft, load: float, loop: WallLoop, walls: Array) -> Array:
