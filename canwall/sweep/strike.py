@@ -359,10 +359,10 @@ class PreparedStrike:
             for i, (stiffness, damping) in enumerate(walls.tolist()):
                 measures[i] = self._strike_over_bus(stiffness, damping)
         else:
-            # One call for all walls of a shaft's bound: between calls, the threads of a sweep would
+            # One call for all that it can be for: between calls, the threads of a sweep would
             # contend for the interpreter's lock.
-            for some in self._bounded_alike(walls):
-                self._prepare_for(walls[some][0, 1])
+            for damping, some in self._bounded_alike(walls):
+                self._prepare_for(damping)
                 struck = measures[some]
                 _strike_all(
                     self._loop,
@@ -381,11 +381,11 @@ class PreparedStrike:
             self._refuse_failed_law(*wall.tolist())
         return measures
 
-    def _bounded_alike(self, walls: Array) -> list[NDArray[np.bool_]]:
-        """Return which walls have the same bound of their stiffness: those of one damping."""
-        if not len(walls) or not self._settings.mechanics.shaft_hz:
-            return [np.ones(len(walls), bool)] if len(walls) else []
-        return [walls[:, 1] == damping for damping in np.unique(walls[:, 1])]
+    def _bounded_alike(self, walls: Array) -> list[tuple[float, NDArray[np.bool_]]]:
+        """Return the walls whose stiffness has one bound: on a shaft, a damping and which have it."""
+        if not self._settings.mechanics.shaft_hz:
+            return [(self._damping, np.ones(len(walls), bool))]
+        return [(damping, walls[:, 1] == damping) for damping in np.unique(walls[:, 1]).tolist()]
 
     def _refuse_failed_law(self, stiffness: float, damping: float) -> NoReturn:
         """Raise RunFailedError for a law that failed on this wall: that is no limit of it."""
