@@ -382,7 +382,7 @@ class PreparedStrike:
         return measures
 
     def _bounded_alike(self, walls: Array) -> list[tuple[float, NDArray[np.bool_]]]:
-        """Return the walls whose stiffness has one bound: on a shaft, a damping and which have it."""
+        """Return walls whose stiffness has one bound: on a shaft, a damping and which have it."""
         if not self._settings.mechanics.shaft_hz:
             return [(self._damping, np.ones(len(walls), bool))]
         return [(damping, walls[:, 1] == damping) for damping in np.unique(walls[:, 1]).tolist()]

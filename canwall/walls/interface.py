@@ -261,9 +261,9 @@ def clear_memory(wall: NDArray[np.void]) -> None:
 #: Rise in a period of a stiffness that the mass in force allows again, as a share of itself:
 #: outside the wall, and inside, where the spring is loaded, at most.
 _RISE_OUTSIDE, _RISE_INSIDE = 0.2, 0.03
-#: Energy that a rise inside may add to the loaded spring, over what the damper takes meanwhile;
-#: rise in a period of a wall at rest, against which the hand holds, as a share of what is allowed.
-_ADDED, _RISE_AT_REST = 1.5, 0.001
+#: Energy that a rise inside may add to the loaded spring, over what the damper takes meanwhile, and
+#: time in which a wall at rest, against which the hand holds, rises to what is allowed [s].
+_ADDED, _RISE_AT_REST_S = 1.5, 1.0
 #: Share of the stiffness asked for from which it grows, where no wall was allowed before.
 _LEAST_SHARE = 1e-3
 
@@ -294,7 +294,7 @@ def _rise(wall: Record, stiffness: float, most: float) -> float:
     if wall.y >= 0.0:
         return rise
     taken = wall.damping * wall.v**2 * wall.period
-    return min(rise, _ADDED * taken / (0.5 * wall.y**2) + _RISE_AT_REST * most)
+    return min(rise, _ADDED * taken / (0.5 * wall.y**2) + most * wall.period / _RISE_AT_REST_S)
 
 
 @compiled
