@@ -185,9 +185,7 @@ def set_estimator(
         raise ValueError(f"a delay of {delay:g} periods is not between 0 and {MAX_DELAY}")
     whole = math.floor(delay)
     fraction = delay - whole
-    estimator["delay_periods"] = whole
-    # (1 + 0.15) − 0.15 is less than 1, and its whole part counts.
-    estimator["told"] = round(delay - margin, 9)
+    estimator["delay_periods"], estimator["told"] = whole, delay - margin
     estimator["mass"], estimator["viscous"] = mass, viscous
     estimator["coulomb"] = coulomb
     kalman = kalman_model(mass, viscous, spring, period, count, force_walk)
@@ -391,13 +389,18 @@ def put_in_flight(in_flight: NDArray[np.float64], force: float) -> None:
     in_flight[0] = force
 
 
+#: Rounding of a delay [periods].
+_ROUNDING = 1e-9
+
+
 @compiled
 def stand_still(estimator: Record, periods: int) -> None:
     """Advance the state over periods without SYNC, in which the drive goes on as it did.
 
     A torque that waits for a SYNC waits on; one that has taken effect stays.
     """
-    force = estimator.in_flight[int(estimator.told)]
+    # (1 + 0.15) − 0.15 is less than 1.
+    force = estimator.in_flight[int(estimator.told + _ROUNDING)]
     for _ in range(min(periods, _LONGEST_GAP + 1)):
         note_missing_sample(estimator)
         if estimator.gap < _LONGEST_GAP:
