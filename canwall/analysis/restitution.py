@@ -52,17 +52,27 @@ def largest_restitution(y: Array, count: float, least: int) -> float:
     """
     largest, start = 0.0, 0
     while start < len(y):
-        enter = start
-        while enter < len(y) and y[enter] >= 0.0:
-            enter += 1
-        leave = enter
-        while leave < len(y) and y[leave] < 0.0:
-            leave += 1
+        enter, leave = _next_contact(y, start)
         if start < enter and leave < len(y):
             fastest_in = _most_in(y, start, enter, count, least)
             largest = max(largest, _least_out(y, leave, count, least) / fastest_in)
         start = leave
     return largest
+
+
+@compiled
+def _next_contact(y: Array, start: int) -> tuple[int, int]:
+    """Return the first sample inside from `start` on, and the first outside after it.
+
+    len(y) for what there is not.
+    """
+    enter = start
+    while enter < len(y) and y[enter] >= 0.0:
+        enter += 1
+    leave = enter
+    while leave < len(y) and y[leave] < 0.0:
+        leave += 1
+    return enter, leave
 
 
 @compiled
@@ -108,17 +118,12 @@ def first_bounce(y: Array, period: float, count: float) -> tuple[float, float]:
     Where a wall has stopped the handle before its surface, it creeps in: below a count a sample its
     speed says nothing, and the restitution is the speed on leaving over a count a sample.
     """
-    enter = 0
-    while enter < len(y) and y[enter] >= 0.0:
-        enter += 1
+    enter, leave = _next_contact(y, 0)
     if enter <= SPAN or enter >= len(y):
         return math.nan, math.nan
     approach = _fastest_crossing(y, enter, -1, count)
     for j in range(max(enter - SPAN, SPAN), enter):
         approach = max(approach, (y[j - SPAN] - y[j]) / SPAN)
-    leave = enter
-    while leave < len(y) and y[leave] < 0.0:
-        leave += 1
     back = leave
     while back < len(y) and back < leave + SPAN and y[back] >= 0.0:
         back += 1
