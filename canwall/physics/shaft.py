@@ -43,6 +43,9 @@ _REACH = 2.0
 _MAX_STEPS = 10_000
 #: Share of a span in which a rotor that sets out from rest does not reverse.
 _SETTING_OUT = 2.0**-20
+#: Share of the torques on a rotor at rest by which rounding may have their sum wrong: a rotor that
+#: is in balance would set out and reverse for ever.
+_BALANCE = 2.0**-50
 
 Array = NDArray[np.float64]
 
@@ -270,14 +273,17 @@ def _segment(
         direction = 1.0 if now.v > 0.0 else -1.0
         return _slip(shaft, piece, now, motor, script, remaining, direction, False, series)
     pull += piece.force - piece.spring * now.y
+    terms = abs(motor.constant) + abs(piece.force) + abs(piece.spring * now.y)
+    terms += shaft.stiffness * (abs(now.load_y) + abs(now.y))
+    stiction = rotor.stiction + _BALANCE * terms
     direction = 1.0 if pull > 0.0 else -1.0
-    if abs(pull) > rotor.stiction:
+    if abs(pull) > stiction:
         return _slip(shaft, piece, now, motor, script, remaining, direction, False, series)
 
     span = _span(shaft, piece, motor, remaining)
     _expand(shaft, piece, now, motor, script, span, math.nan, False, series)
-    up = _first_zero(series[4], rotor.stiction, -1.0, 0.0, 1.0)
-    down = _first_zero(series[4], rotor.stiction, 1.0, 0.0, 1.0)
+    up = _first_zero(series[4], stiction, -1.0, 0.0, 1.0)
+    down = _first_zero(series[4], stiction, 1.0, 0.0, 1.0)
     s = min(up, down)
     end = _state(series, span, min(s, 1.0))
     if s > 1.0:

@@ -154,6 +154,23 @@ def test_friction_on_the_rotor_is_as_scipy_has_it(stiction: float) -> None:
     assert events > 12
 
 
+@pytest.mark.parametrize("stiction", [0.0, 5e-3])
+def test_it_comes_to_rest_in_balance(stiction: float) -> None:
+    (s,) = shaft(0.0, stiction, 5e-4, 3e-3, load=(2e-4, 0.02, 1.0))
+    draw = np.random.default_rng(1)
+    for _ in range(30):
+        u, w = float(draw.normal(0.0, 0.03)), float(draw.normal(0.0, 0.03))
+        motor, script = Force(u, 0.0, 0.0, 0.0), Force(w, 0.0, 0.0, 0.0)
+        now = TwoMasses(0.0, 0.0, 0.0, 0.0)
+        for _ in range(1000):
+            # A period of the SYNC, which the drive's own cycle divides.
+            now = advance_shaft(s, now, motor, script, 8.34e-4)
+            now = advance_shaft(s, now, motor, script, 1.66e-4)
+        assert max(abs(now.v), abs(now.load_v)) < 1e-9
+        twist = now.load_y - now.y
+        assert w - s["stiffness"] * twist - now.load_y == pytest.approx(0.0, abs=1e-9)
+
+
 @settings(derandomize=True, deadline=None, max_examples=40)
 @given(st.integers(0, 10_000), st.floats(1.0, 3.0), st.sampled_from([0.0, 3e-3]))
 def test_dividing_a_motion_changes_nothing_and_no_energy_comes_of_it(

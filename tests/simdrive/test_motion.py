@@ -274,3 +274,9 @@ def test_the_current_loop_knows_torques_in_steps() -> None:
         smooth.advance(step, PERIOD)
         assert stepped.position_rad == pytest.approx(smooth.position_rad, rel=1e-14)
     assert stepped.torque_nm() is None
+
+
+def test_a_motion_that_is_no_number_is_an_error() -> None:
+    motion = ServoMotion(SMOOTH, COUNTS_PER_REV)
+    with pytest.raises(ArithmeticError, match="not a number"):
+        motion.advance(math.nan, PERIOD)

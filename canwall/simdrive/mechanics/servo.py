@@ -220,6 +220,8 @@ def _move_on(servos: NDArray[np.void], push: float, slope: float, duration: floa
         now = Grasp(servo.y, servo.v, servo.hand_y, servo.hand_v, servo.touching)
         now = advance_grasp(servo.handle[0], servo.joined[0], hand, now, motor, script, duration)
         servo.y, servo.v, servo.hand_y, servo.hand_v, servo.touching = now
+    if math.isnan(servo.y):
+        raise ArithmeticError("the simulated handle's motion is not a number: too many events")
     servo.torque = servo.demand
     if excess != 0.0:
         servo.torque += excess * math.exp(-rate * duration)
