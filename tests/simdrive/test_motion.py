@@ -277,6 +277,6 @@ def test_the_current_loop_knows_torques_in_steps() -> None:
 
 
 def test_a_motion_that_is_no_number_is_an_error() -> None:
-    motion = ServoMotion(SMOOTH, COUNTS_PER_REV)
+    motion = ServoMotion(SMOOTH, PERIOD, COUNTS_PER_REV)
     with pytest.raises(ArithmeticError, match="not a number"):
         motion.advance(math.nan, PERIOD)
