@@ -275,15 +275,17 @@ def _segment(
     pull += piece.force - piece.spring * now.y
     terms = abs(motor.constant) + abs(piece.force) + abs(piece.spring * now.y)
     terms += shaft.stiffness * (abs(now.load_y) + abs(now.y))
-    stiction = rotor.stiction + _BALANCE * terms
+    rounding = _BALANCE * terms
     direction = 1.0 if pull > 0.0 else -1.0
-    if abs(pull) > stiction:
+    if abs(pull) > rotor.stiction + rounding:
         return _slip(shaft, piece, now, motor, script, remaining, direction, False, series)
 
     span = _span(shaft, piece, motor, remaining)
     _expand(shaft, piece, now, motor, script, span, math.nan, False, series)
-    up = _first_zero(series[4], stiction, -1.0, 0.0, 1.0)
-    down = _first_zero(series[4], stiction, 1.0, 0.0, 1.0)
+    # Above what it is held by: the series may begin at the other side of that, and fall.
+    loose = rotor.stiction + 2.0 * rounding
+    up = _first_zero(series[4], loose, -1.0, 0.0, 1.0)
+    down = _first_zero(series[4], loose, 1.0, 0.0, 1.0)
     s = min(up, down)
     end = _state(series, span, min(s, 1.0))
     if s > 1.0:
