@@ -130,12 +130,20 @@ def measure_strike(
         radius: Radius of the handle [m].
         count: One encoder count Δ [rad].
         torque_step: One step of torque f_LSB [N·m].
-        stiffness: Stiffness asked for [N·m/rad].
+        stiffness: Stiffness asked for [N·m/rad]; without contact it counts as the one in force.
         swing_samples: Samples in a period of the shaft's resonance.
         measures: Result, shape (1,), dtype MEASURES.
     """
     into: Record = measures[0]
     window = metrics.event_window(period)
+    first, after, contacts = _count_contacts(y, force)
+    into.contacts = contacts
+    into.stiffness_in_force = into.stiffness_in_force_least = into.mass_est = math.nan
+    if contacts:
+        pressed = pressed_cycle(y, force)
+        into.stiffness_in_force, into.mass_est = in_force[0, pressed], in_force[1, pressed]
+        into.stiffness_in_force_least = least_in_contact(y, force, in_force[0])
+        stiffness = into.stiffness_in_force
     tolerance = metrics.amplitude_tolerance(stiffness, count, torque_step)
     into.trip = trip
     into.alarms = alarms
@@ -162,19 +170,12 @@ def measure_strike(
     into.chatters_ripple = metrics.is_felt(into.ripple, into.referent_ripple)
     moves = thrown or into.chatters_counts or into.chatters_kick or into.chatters_amplitude
     into.chatters = moves or into.chatters_ripple
-    first, after, contacts = _count_contacts(y, force)
-    into.contacts = contacts
     into.amplitude = into.frequency = 0.0
     if into.chatters:
         cycle = y[start:stop] if stop > start else y[first:after]
         into.amplitude, into.frequency = metrics.limit_cycle(cycle, period)
         if not moves:  # it may be felt within one count
             _, into.frequency = metrics.limit_cycle(felt[start:stop], period)
-    into.stiffness_in_force = into.stiffness_in_force_least = into.mass_est = math.nan
-    if contacts:
-        pressed = pressed_cycle(y, force)
-        into.stiffness_in_force, into.mass_est = in_force[0, pressed], in_force[1, pressed]
-        into.stiffness_in_force_least = least_in_contact(y, force, in_force[0])
     into.penetration = max(-y.min(), 0.0) if len(y) else 0.0
     into.first_depth = first_depth(y)
     into.referent_first_depth = first_depth(referent)

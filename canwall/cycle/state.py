@@ -264,17 +264,16 @@ def _plain_walk(settings: Settings) -> float | None:
 def _hands(settings: Settings) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return masses and viscous dampings of the bank: the drive with lighter and heavier hands.
 
-    Of a hand that is known they are those of `[mechanics]`.
+    Of a hand that is known they are those of `[mechanics]`. On an elastic shaft, whose filters are
+    slow, none has a damping of its own: a hand that lacks it would swing in the wall.
     """
     operator, mechanics = settings.operator, settings.mechanics
     if not operator.adapt:
         mass, viscous, _ = _model(settings)
         return np.array([mass]), np.array([viscous])
     masses = np.geomspace(*settings.masses, operator.filters)
-    hands = [
-        hand_damping(max(mass - mechanics.inertia_kg_m2, 0.0), operator.damping_nm_s_per_rad)
-        for mass in masses.tolist()
-    ]
+    heavy = 0.0 if mechanics.shaft_hz else operator.damping_nm_s_per_rad
+    hands = [hand_damping(max(m - mechanics.inertia_kg_m2, 0.0), heavy) for m in masses.tolist()]
     return masses, mechanics.viscous_nm_s_per_rad + np.array(hands)
 
 

@@ -87,8 +87,12 @@ def summarise(
     found = metrics.strikes(touched, settings.bus.cycle_s, _changes(signals))
     on_the_way = (y, force, work, stiffness, laws, settings, units, referent, referent_felt)
     strikes = [
-        _strike(strike, *on_the_way, thrown=thrown and strike is found[-1])
-        | _in_force(strike, y, force, in_force)
+        _strike(
+            strike,
+            *on_the_way,
+            in_force=_in_force(strike, y, force, in_force),
+            thrown=thrown and strike is found[-1],
+        )
         for strike in found
     ]
     chattering = [s for s in strikes if s["chatter"]]
@@ -133,13 +137,14 @@ def _strike(
     units: DriveUnits,
     referent: Array | None,
     referent_felt: Array | None,
+    in_force: dict[str, Any],
     thrown: bool,
 ) -> dict[str, Any]:
     cycles, start = strike.cycles, strike.cycles.start
     period = settings.bus.cycle_s
     inside = y[cycles]
     tolerance = metrics.amplitude_tolerance(
-        float(stiffness[start]), units.rad_per_count, units.nm_per_mille
+        in_force["stiffness_in_force"], units.rad_per_count, units.nm_per_mille
     )
     running = work[cycles] - work[start]
     energy_tolerance = units.rad_per_count * float(np.abs(force[cycles]).max(initial=0.0))
@@ -199,6 +204,7 @@ def _strike(
         "felt_ripple_n": _known(ripple.measured),
         "chatter_amplitude_rad": amplitude,
         "chatter_frequency_hz": frequency,
+        **in_force,
     }
 
 

@@ -214,3 +214,13 @@ def test_a_wall_is_known_best_before_the_hand_leaves_it() -> None:
     force[150:152] = 1.0  # held for two cycles more
     assert pressed_cycle(y, force) == 50 + int(102 * 0.9) - 1
     assert pressed_cycle(y[:13], force) == 10 + 1
+
+
+@pytest.mark.parametrize(("stiffness", "chatters"), [(100.0, True), (0.1, False)])
+def test_steps_of_the_torque_explain_the_motion_of_the_wall_in_force(
+    stiffness: float, chatters: bool
+) -> None:
+    """Two walls for which 100 N·m/rad were asked: the torque's steps of 1e-6 N·m."""
+    found = measured(pressed() + sine(1e-5, 25.0), in_force=np.full((2, END), stiffness))
+    assert found["tolerance"] == pytest.approx(max(6.0 * COUNT, 3e-6 / stiffness))
+    assert found["chatters_amplitude"] is chatters
