@@ -104,7 +104,7 @@ def quiet_strikes(draw: int) -> Iterator[Alarm | None]:
         guard = loop.cycle["guard"].reshape(-1)[0]
         seen = slice(int(guard["first_alarm"]) + 1)
         thrown, buzzed = throws(signals[0, seen]), buzzes(signals[1, seen], prepared.period)
-        yield Alarm(f"{stiffness:.4g} N·m/rad, B {damping:.3g}: {axes}", thrown, buzzed)
+        yield Alarm(f"{stiffness} N·m/rad, B {damping}: {axes}", thrown, buzzed)
 
 
 def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
@@ -119,11 +119,11 @@ def throws(positions: NDArray[np.float64]) -> bool:
     inside = positions < 0.0
     entered = np.flatnonzero(~inside[:-1] & inside[1:]) + 1
     left = np.flatnonzero(inside[:-1] & ~inside[1:]) + 1
-    # The speed after a contact takes one sample more.
+    # The speed after a contact takes a sample more; the torque of its last cycles acts up to two more.
     for end in left[(left >= len(positions) - _TOLD_WITHIN) & (left < len(positions) - 1)]:
         (begin,) = entered[entered < end][-1:]
         came = positions[begin - 2] - positions[begin - 1]
-        if positions[end + 1] - positions[end] > _FASTER * came:
+        if np.diff(positions[end : end + 4]).max() > _FASTER * came:
             return True
     return False
 

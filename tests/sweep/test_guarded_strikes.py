@@ -12,6 +12,8 @@ def test_contact_that_leaves_faster_than_it_came_throws() -> None:
     came = np.array([3.0, 2.0, 1.0, -0.5, -0.2])
     assert throws(np.append(came, [0.8, 2.0, 3.2, 4.4]))
     assert not throws(np.append(came, [0.8, 1.8, 2.8, 3.8]))
+    # A torque that acts after the contact.
+    assert throws(np.append(came, [0.8, 1.6, 2.5, 3.7]))
     # One that has only just ended has no speed yet.
     assert not throws(np.append(came, [0.8]))
     # What is long over is not what the guard tells of.
