@@ -128,7 +128,8 @@ def _set_wall_inputs(cycle: Record, rendered: Record, sample: float, due: bool) 
     y, wall.v = actuation_state(estimator)
     wall.y = y - origin
     wall.d = estimator.d - wall.spring * origin
-    put_in_force(wall)
+    if due:
+        put_in_force(wall)
 
 
 @compiled

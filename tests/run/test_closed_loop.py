@@ -63,6 +63,16 @@ def test_hand_that_is_identified_adds_no_damping_to_the_device(law: str) -> None
     assert np.all(deep["force"] < 1.2 * 0.8 * viscous / settings.bus.cycle_s * -deep["y"])
 
 
+def test_stiffness_in_force_follows_the_mass_when_the_law_is_evaluated() -> None:
+    """Between two evaluations no torque changes that a rise could be paid with."""
+    keys = {"wall.divider": 4, "wall.cap": 0.8, "wall.stiffness_nm_per_rad": 2000.0}
+    keys |= {"operator.adapt": True, "mechanics.inertia_kg_m2": 1e-4}
+    rows = simulate(strikes(keys), 1_500).rows[200:]  # faded in
+    changes = rows["j"][1:][np.diff(rows["stiffness_in_force"]) != 0.0]
+    assert len(changes) > 5
+    assert len(set((changes % 4).tolist())) == 1
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS)
 def test_every_law_comes_to_the_same_bits(make_rig: RigFactory, law: str) -> None:
