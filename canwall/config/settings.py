@@ -174,8 +174,8 @@ class Operator(Section):
             [mechanics].
         heaviest_kg_m2: Largest inertia of drive, handle and hand. Default: 4.4e-3 more than the
             lightest, an arm at a handle of 80 mm.
-        damping_nm_s_per_rad: Damping of a heavy hand; a light one has less. On an elastic shaft
-            all hands have none.
+        damping_nm_s_per_rad: Damping of a heavy hand; a light one has less. On a shaft that makes
+            the filters slow all hands have none.
         filters: Number of hands, in geometric progression, that are compared in each cycle.
     """
 

@@ -264,16 +264,17 @@ def _plain_walk(settings: Settings) -> float | None:
 def _hands(settings: Settings) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return masses and viscous dampings of the bank: the drive with lighter and heavier hands.
 
-    Of a hand that is known they are those of `[mechanics]`. On an elastic shaft, whose filters are
-    slow, none has a damping of its own: a hand that lacks it would swing in the wall.
+    Of a hand that is known they are those of `[mechanics]`.
     """
     operator, mechanics = settings.operator, settings.mechanics
     if not operator.adapt:
         mass, viscous, _ = _model(settings)
         return np.array([mass]), np.array([viscous])
     masses = np.geomspace(*settings.masses, operator.filters)
-    heavy = 0.0 if mechanics.shaft_hz else operator.damping_nm_s_per_rad
-    hands = [hand_damping(max(m - mechanics.inertia_kg_m2, 0.0), heavy) for m in masses.tolist()]
+    hands = [
+        hand_damping(max(mass - mechanics.inertia_kg_m2, 0.0), operator.damping_nm_s_per_rad)
+        for mass in masses.tolist()
+    ]
     return masses, mechanics.viscous_nm_s_per_rad + np.array(hands)
 
 
@@ -294,7 +295,12 @@ def set_delay(cycle: NDArray[np.void], settings: Settings, delay: float) -> None
     if force_walk is None:
         masses, dampings = _hands(settings)
         mass, viscous, coulomb = masses[0], dampings[0], 0.0
-        bandwidth = min(bandwidth, lightest_bandwidth(delay, period))
+        lightest = lightest_bandwidth(delay, period)
+        if bandwidth < lightest:
+            # The shaft makes the filters slow. With a damping that a hand lacks they would let it
+            # swing in the wall.
+            dampings[:] = viscous
+        bandwidth = min(bandwidth, lightest)
         force_walk = force_walk_of(bandwidth, mass, period, count)
         set_bank(
             cycle["bank"][0],
