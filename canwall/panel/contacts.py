@@ -214,7 +214,7 @@ class ContactMeter:
             felt = band_rms(self._band, np.ascontiguousarray(force), len(y) // 2, len(y))
             ripple = felt / handle_radius(scale.handle_radius_m)
         tolerance = metrics.amplitude_tolerance(
-            float(self._last["stiffness"][0]), scale.count_rad, scale.torque_step_nm
+            float(self._last["stiffness_in_force"][0]), scale.count_rad, scale.torque_step_nm
         )
         energy_tolerance = scale.count_rad * float(np.abs(force).max())
         verdict = metrics.chatter(
