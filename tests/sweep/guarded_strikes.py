@@ -119,7 +119,7 @@ def throws(positions: NDArray[np.float64]) -> bool:
     inside = positions < 0.0
     entered = np.flatnonzero(~inside[:-1] & inside[1:]) + 1
     left = np.flatnonzero(inside[:-1] & ~inside[1:]) + 1
-    # The speed after a contact takes a sample more; the torque of its last cycles acts up to two more.
+    # The speed after a contact takes a sample more; its last torques act up to two more.
     for end in left[(left >= len(positions) - _TOLD_WITHIN) & (left < len(positions) - 1)]:
         (begin,) = entered[entered < end][-1:]
         came = positions[begin - 2] - positions[begin - 1]
