@@ -132,6 +132,21 @@ class Ripple:
     source: str = ""
 
 
+@dataclass(frozen=True)
+class Comparison:
+    """Motion that the wall's is compared with.
+
+    Attributes:
+        referent: Positions of the continuous referent, shape (n,).
+        tolerance: `amplitude_tolerance`, by which a motion may exceed it, in the unit of y.
+        swing_samples: Samples in a period of the shaft's resonance, over which speeds are compared.
+    """
+
+    referent: Array
+    tolerance: float
+    swing_samples: int = 1
+
+
 @compiled
 def amplitude_tolerance(stiffness: float, count: float, force_step: float) -> float:
     """Return the motion that quantisation alone explains: max(6·Δ, 3·f_LSB/K) [rad or m]."""
@@ -149,40 +164,36 @@ def moves_more(motion: float, referent: float, tolerance: float) -> bool:
 
 def chatter(
     y: Array,
-    referent: Array | None,
+    comparison: Comparison | None,
     cycle_s: float,
-    tolerance: float,
     count: float,
     gives_energy: bool = True,
     ripple: Ripple | None = None,
-    swing_samples: int = 1,
 ) -> Chatter:
     """Judge whether a wall chattered in one strike.
 
     Chatter is more makes and breaks of contact than the referent has (`bounces_more`), a contact
     that is left faster than it was entered (`restitution.kicks`), motion about the settled contact
-    that exceeds the referent's by more than `tolerance`, or a felt ripple that exceeds the
+    that exceeds the referent's by more than the tolerance, or a felt ripple that exceeds the
     referent's by more than QUIET_N. Without a referent (a person at the handle, who may pull) kicks
     and motion are not judged.
 
     Args:
         y: Positions relative to the wall over the strike, shape (n,).
-        referent: Positions of the continuous referent, shape (n,), or None.
+        comparison: The referent, or None.
         cycle_s: Period of the SYNC [s].
-        tolerance: `amplitude_tolerance`, in the unit of y.
         count: One encoder count, in the unit of y.
         gives_energy: True if the wall put out energy in the strike.
         ripple: Felt ripple, if it is known.
-        swing_samples: Samples in a period of the shaft's resonance.
     """
     ripple = Ripple() if ripple is None else ripple
     # The busiest window of each is compared, not window by window: a wall that loses some energy
     # bounces as its referent does, only earlier.
     window = event_window(cycle_s)
     events = busiest_window(y, window, count)
-    expected = 0 if referent is None else busiest_window(referent, window, count)
+    expected = 0 if comparison is None else busiest_window(comparison.referent, window, count)
     if bounces_more(events, expected, gives_energy):
-        compared = "without a referent" if referent is None else f"the referent {expected}"
+        compared = "without a referent" if comparison is None else f"the referent {expected}"
         reason = f"{events} makes and breaks within {EVENT_WINDOW_S * 1e3:.0f} ms, {compared}"
         return Chatter(True, reason, "counts")
     felt = (
@@ -190,10 +201,12 @@ def chatter(
         f"{ripple.source}, quiet up to {QUIET_N:g} N"
     )
     ripples = is_felt(ripple.measured, ripple.referent)
-    if referent is None:
+    if comparison is None:
         if ripples:
             return Chatter(True, felt, "ripple")
         return Chatter(False, "too few makes and breaks; amplitude not judged without a referent")
+    referent, tolerance = comparison.referent, comparison.tolerance
+    swing_samples = comparison.swing_samples
     _, start, stop = settled_window(referent, tolerance, cycle_s)
     until = judged_until(start, stop, len(y))
     if kicks(y[:until], referent[:until], count, swing_samples):

@@ -25,7 +25,6 @@ class Scale:
     Attributes:
         cycle_s: Period of the SYNC [s].
         count_rad: One encoder count [rad].
-        torque_step_nm: Smallest step of the torque [N·m].
         handle_radius_m: Radius of the handle [m]; None: HANDLE_RADIUS_M.
         laws: Names of the run's laws, to which the rows have indices.
         orientation: Direction out of the wall on the drive's axis, 1 or −1.
@@ -33,7 +32,6 @@ class Scale:
 
     cycle_s: float
     count_rad: float
-    torque_step_nm: float
     handle_radius_m: float | None = None
     laws: Sequence[str] = ()
     orientation: float = 1.0
@@ -207,21 +205,17 @@ class ContactMeter:
         """
         scale, (y, force) = self._scale, self._recent
         touched = metrics.contacts(y, force)
-        if not touched or self._last is None:
+        if not touched:
             return False, 0.0, math.nan
         ripple = math.nan
         if len(y) == self._length and touched[0] == slice(0, len(y)):
             felt = band_rms(self._band, np.ascontiguousarray(force), len(y) // 2, len(y))
             ripple = felt / handle_radius(scale.handle_radius_m)
-        tolerance = metrics.amplitude_tolerance(
-            float(self._last["stiffness_in_force"][0]), scale.count_rad, scale.torque_step_nm
-        )
         energy_tolerance = scale.count_rad * float(np.abs(force).max())
         verdict = metrics.chatter(
             np.ascontiguousarray(y),
             None,
             scale.cycle_s,
-            tolerance,
             scale.count_rad,
             bool(metrics.energy_out(y, force).max() > energy_tolerance),
             metrics.Ripple(ripple),
@@ -241,6 +235,6 @@ def prepare() -> None:
     rows = np.zeros(500, ROW)
     rows["j"], rows["phase"] = np.arange(len(rows)), Phase.RENDERING
     rows["y"], rows["force_applied"] = -1.0, np.arange(len(rows)) % 2
-    meter = ContactMeter(Scale(1e-3, 1e-3, 1e-3))
+    meter = ContactMeter(Scale(1e-3, 1e-3))
     for _ in meter.take(rows):
         meter.chatter()

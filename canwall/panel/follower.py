@@ -218,7 +218,6 @@ class Follower:
             self._scale(
                 cycle_s,
                 float(settings["count_rad"]),
-                float(settings["rated_torque_nm"]) / 1000.0,
                 settings.get("handle_radius_m"),
                 [law["name"] for law in settings["laws"]],
                 Wall(side=settings["side"]).orientation,

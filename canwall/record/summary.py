@@ -148,12 +148,14 @@ def _strike(
     )
     running = work[cycles] - work[start]
     energy_tolerance = units.rad_per_count * float(np.abs(force[cycles]).max(initial=0.0))
-    seen = cycles
+    seen, comparison = cycles, None
     if referent is None or referent_felt is None:
         ripple, judged = _ripple_of_contact(strike, force, settings)
     else:
         outside = _last_outside(y, referent, start, units.rad_per_count)
         seen = slice(max(outside - SPAN, 0), cycles.stop)  # with the speed of approach
+        resonance = settings.simulation.shaft_hz if settings.simulation else 0.0
+        comparison = metrics.Comparison(referent[seen], tolerance, swing_samples(resonance, period))
         rest, first, last = metrics.settled_window(referent[seen], tolerance, period)
         windows = (rest + seen.start, first + seen.start, last + seen.start)
         judged = slice(*windows[1:])
@@ -162,13 +164,11 @@ def _strike(
         )
     verdict = metrics.chatter(
         y[seen],
-        None if referent is None else referent[seen],
+        comparison,
         period,
-        tolerance,
         units.rad_per_count,
         bool(running.max() > energy_tolerance),
         ripple,
-        swing_samples(settings.simulation.shaft_hz if settings.simulation else 0.0, period),
     )
     if thrown:
         verdict = metrics.Chatter(True, "it threw the handle beyond the limits", "limits")

@@ -14,6 +14,7 @@ from canwall.analysis.metrics import (
     QUIET_N,
     STRIKE_GAP_S,
     Chatter,
+    Comparison,
     Ripple,
     StrikeContacts,
     amplitude_tolerance,
@@ -167,7 +168,11 @@ def pressing(seconds: float = 0.6) -> Array:
 
 
 def judged(y: Array, referent: Array | None) -> Chatter:
-    return chatter(y, referent, PERIOD, TOLERANCE, COUNT)
+    return chatter(y, compared(referent), PERIOD, COUNT)
+
+
+def compared(referent: Array | None) -> Comparison | None:
+    return None if referent is None else Comparison(referent, TOLERANCE)
 
 
 def oscillation(y: Array, amplitude: float, frequency: float = 20.0) -> Array:
@@ -259,7 +264,7 @@ def test_a_motion_of_six_counts_is_what_quantisation_explains(counts: int) -> No
 def test_a_ripple_that_is_felt_is_chatter(referent: Array | None) -> None:
     def felt(measured: float, own: float = 0.0) -> Chatter:
         ripple = Ripple(measured, own, ", by a sensor")
-        return chatter(pressing(), referent, PERIOD, TOLERANCE, COUNT, ripple=ripple)
+        return chatter(pressing(), compared(referent), PERIOD, COUNT, ripple=ripple)
 
     assert not felt(0.99 * QUIET_N).chatters
     assert not felt(0.5, 0.45).chatters

@@ -15,7 +15,7 @@ def test_a_wall_that_moves_is_no_motion_of_the_handle(side: float) -> None:
     rows["j"], rows["phase"], rows["y"] = np.arange(len(rows)), Phase.RENDERING, handle - moved
     rows["wall_position_rad"] = side * moved
     rows["force_applied"][1:5] = 2.0
-    meter = ContactMeter(Scale(1e-3, 1e-6, 1e-3, orientation=side))
+    meter = ContactMeter(Scale(1e-3, 1e-6, orientation=side))
     # The rows come in two parts, one of which ends in contact.
     (contact,) = [s.ended for part in (rows[:3], rows[3:]) for s in meter.take(part) if s.ended]
     assert isinstance(contact, Contact)
@@ -29,7 +29,7 @@ def test_wall_that_fades_in_around_the_handle_is_no_contact() -> None:
     rows = np.zeros(len(y), ROW)
     rows["j"], rows["y"] = np.arange(len(rows)), y
     rows["force_applied"][2:], rows["phase"][2:] = np.maximum(-y[2:], 0.0), Phase.RENDERING
-    meter = ContactMeter(Scale(1e-3, 1e-6, 1e-3))
+    meter = ContactMeter(Scale(1e-3, 1e-6))
     (contact,) = [s.ended for part in (rows[:3], rows[3:]) for s in meter.take(part) if s.ended]
     assert (contact.n, contact.depth_rad) == (1, 1.0)
 
@@ -40,7 +40,7 @@ def test_a_strike_is_known_by_the_cycle_in_which_it_began() -> None:
     rows = np.zeros(len(y), ROW)
     rows["j"], rows["phase"], rows["y"] = np.arange(len(rows)), Phase.RENDERING, y
     rows["t_s"] = 1e-3 * rows["j"]
-    meter = ContactMeter(Scale(1e-3, 1e-6, 1e-3))
+    meter = ContactMeter(Scale(1e-3, 1e-6))
     ended = []
     for part in np.split(rows, 14):
         for _ in meter.take(part):
