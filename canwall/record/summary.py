@@ -143,9 +143,6 @@ def _strike(
     cycles, start = strike.cycles, strike.cycles.start
     period = settings.bus.cycle_s
     inside = y[cycles]
-    tolerance = metrics.amplitude_tolerance(
-        in_force["stiffness_in_force"], units.rad_per_count, units.nm_per_mille
-    )
     running = work[cycles] - work[start]
     energy_tolerance = units.rad_per_count * float(np.abs(force[cycles]).max(initial=0.0))
     seen, comparison = cycles, None
@@ -154,6 +151,9 @@ def _strike(
     else:
         outside = _last_outside(y, referent, start, units.rad_per_count)
         seen = slice(max(outside - SPAN, 0), cycles.stop)  # with the speed of approach
+        tolerance = metrics.amplitude_tolerance(
+            in_force["stiffness_in_force"], units.rad_per_count, units.nm_per_mille
+        )
         resonance = settings.simulation.shaft_hz if settings.simulation else 0.0
         comparison = metrics.Comparison(referent[seen], tolerance, swing_samples(resonance, period))
         rest, first, last = metrics.settled_window(referent[seen], tolerance, period)
