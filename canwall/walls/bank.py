@@ -19,7 +19,12 @@ from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
 from canwall.walls.bank_gains import PACES, QUICKER, STEADIEST, set_filters, stiffest_walls
-from canwall.walls.bank_pace import CALM_S, LIVELY_S, is_lively
+from canwall.walls.bank_pace import (
+    is_lively,
+    note_rest,
+    reset_rest,
+    set_rest,
+)
 from canwall.walls.bank_trend import (
     correct_in_flight,
     follow_trend,
@@ -78,7 +83,8 @@ BANK = np.dtype(
         ("trend_gain", "f8", (MAX_FILTERS,)),
         ("trend_left_pressed", "f8"),
         ("trend_left", "f8"),
-        # Stiffness of the softest wall that counts as stiff, and True if the one in force does.
+        # Stiffness in force, of the softest wall that counts as stiff, and True if the former does.
+        ("stiffness", "f8"),
         ("stiff_from", "f8"),
         ("stiff", "?"),
         # Samples since the wall gave a torque, the number from which on that is a flight, and True
@@ -123,6 +129,18 @@ BANK = np.dtype(
         ("untimely", "f8", (MAX_FILTERS,)),
         ("sampled", "f8"),
         ("equal", "i8"),  # samples in a row up to now
+        # The sample at which the handle stuck last, and samples since then and since it broke loose
+        # or moved; their numbers: equal ones of a handle that sticks, those within which it breaks
+        # loose, and those for which it settles.
+        ("stuck_at", "f8"),
+        ("since_stuck", "i8"),
+        ("since_loose", "i8"),
+        ("sticks", "i8"),
+        ("breaks_loose", "i8"),
+        ("settles", "i8"),
+        # Number of equal samples from which on the torque may be held, and that torque; 0: none.
+        ("holds_from", "i8"),
+        ("held", "f8"),
         # Over a period: Φ row by row, and the effects on (y, ẏ) of the older force, which acts up
         # to the instant of actuation, and of the newer one.
         ("phi", "f8", (4, MAX_FILTERS)),
@@ -158,6 +176,8 @@ BANK = np.dtype(
     align=True,
 )
 
+#: Change of a torque in a period up to which it may be held, over that by a count.
+_STEADY_TORQUE = 0.1
 #: Share of its gain within which the estimator has nearly settled: meanwhile nothing is identified.
 _NEARLY_SETTLED = 0.01
 #: Time without torque after which another hand may be at the handle [s].
@@ -212,14 +232,14 @@ def set_bank(
     bank["log_step"] = math.log(masses[-1] / masses[0]) / (n - 1) if n > 1 else 0.0
     bank["spring"] = spring
     bank["forgotten"] = round(_FORGOTTEN_S / period)
-    bank["lively"], bank["calm"] = round(LIVELY_S / period), round(CALM_S / period)
+    set_rest(bank, period)
     set_trend(bank, masses[0], period)
     told = delay - margin
     bank["delay"], bank["told"] = delay, told
     lightest = float(masses[0])
     if n == 1 and shaft is None:
         lightest *= _KNOWN_LIGHTEST
-    set_regression(bank["regression"][0, 0], lightest, period, count, told, shaft)
+    set_regression(bank["regression"][0, 0], lightest, period, count, told, shaft, n == 1)
     slower = 1 if shaft is None else OBSERVER_SLOWER_BEHIND_SHAFT
     set_probe(bank["probe"][0, 0], lightest, period, count, slower)
     bank["stiffest"] = np.inf
@@ -243,7 +263,7 @@ def reset_bank(bank: NDArray[np.void], y: float) -> None:
     bank["place"], bank["spread"], bank["known"] = 0.0, 0.0, False
     bank["mass"] = np.exp(bank["log_lightest"])
     bank["at_rest"] = 0
-    bank["sampled"], bank["equal"], bank["moved"] = y, 0, bank["calm"]
+    reset_rest(bank, y)
     # None of either: the first cycle sets what depends on them.
     bank["delay_in_force"], bank["age"] = -1.0, 0.0
     bank["pace"] = bank["light_pace"] = -1
@@ -285,7 +305,9 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
         state[1, i] += share * residual / bank.regression[0].period
         if follows:
             follow_trend(bank, i, bank.trend_gain[i] * gain[2, i] * (near + far))
-    _bound_velocity(bank, y_sample)
+    note_rest(bank, y_sample)
+    _bound_velocity(bank)
+    _hold_torque(bank, estimator, y_sample)
     changed = _identify(bank, estimator, y_sample)
     changed |= _follow_delay(bank, estimator)
     estimator.y, estimator.v = _in_force(bank, state[0]), _in_force(bank, state[1])
@@ -350,15 +372,13 @@ def _set_share(bank: Record, share: float) -> None:
 
 
 @compiled
-def _bound_velocity(bank: Record, y_sample: float) -> None:
+def _bound_velocity(bank: Record) -> None:
     """Let no filter move faster than equal samples allow: by a count each way meanwhile.
 
     Stiction is in no model: a filter would have a handle that sticks creep under the wall's force,
     until its bias force has followed, and the wall would push until it breaks loose. Its state is
     projected onto the bound with its covariance (Simon, IET Control Theory Appl. 4, 2010).
     """
-    bank.equal = bank.equal + 1 if y_sample == bank.sampled else 0
-    bank.sampled = y_sample
     if bank.equal == 0:
         return
     regression, state, also = bank.regression[0], bank.state, bank.with_velocity
@@ -370,6 +390,29 @@ def _bound_velocity(bank: Record, y_sample: float) -> None:
         state[0, i] += also[0, i] * excess
         state[1, i] += excess
         state[2, i] += also[1, i] * excess
+
+
+@compiled
+def _hold_torque(bank: Record, estimator: Record, y_sample: float) -> None:
+    """Hold the torque of a handle that sticks, once it is that of the wall within a count.
+
+    All filters rest where the wall gives it. Else they would go on creeping, and the torque with
+    them until the handle breaks loose: it would hunt.
+    """
+    f, stiffness = estimator.in_flight[0], bank.stiffness
+    count_torque = stiffness * bank.regression[0].resolution
+    if bank.equal < bank.holds_from or abs(f - bank.held) > _STEADY_TORQUE * count_torque:
+        bank.held = 0.0
+    if bank.equal < bank.holds_from or stiffness <= 0.0 or f == 0.0:
+        return
+    if bank.held == 0.0:
+        steady = abs(f - estimator.in_flight[1]) <= _STEADY_TORQUE * count_torque
+        if not steady or abs(f + stiffness * y_sample) > count_torque:
+            return
+        bank.held = f
+    for i in range(bank.count):
+        bank.state[0, i], bank.state[1, i] = -bank.held / stiffness, 0.0
+        bank.state[2, i], bank.trend[i] = -bank.held, 0.0
 
 
 @compiled

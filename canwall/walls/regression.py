@@ -57,6 +57,11 @@ REGRESSION = np.dtype(
         ("surprise", "f8", (6,)),
         ("information", "f8", (6, 6)),  # weighted sums of their products
         ("normal", "f8", (6, 6)),  # the same with what is known before, as it is being solved
+        # Surprise by a push that grows, as found before the wall gives a torque [rad], the share of
+        # a difference by which it follows, and the part of it that is left after a period under one.
+        ("growth", "f8"),
+        ("growth_followed", "f8"),
+        ("growth_left", "f8"),
         ("noise", "f8"),  # mean square of what nothing explains [rad²]
         ("swing", SWING, (1,)),
         ("swung", "?"),  # a swing has told, at this sample, that the hand is a heavier one
@@ -96,6 +101,9 @@ HAND_RATE, _CALM_HAND_RATE = 8.0, 1.0
 #: from which on it goes to or fro [N·m/s]. Below it noise makes turns; the higher it is, the louder
 #: a swing is when it tells.
 _HEAVIER, _SWING_RATE = 1.5, 0.6
+#: Share of what is not expected that is taken for growth of the push, before the wall gives a
+#: torque, and time constant with which that growth is forgotten under one [s].
+_GROWTH_FOLLOWED, _GROWTH_S = 0.3, 0.02
 #: Random walk of that change [N·m/s per √s]: within 10 ms a hand begins to push, and ends.
 _HAND_RATE_WALK = 20.0
 #: Torque that says something whatever friction does, as a multiple of that of a hand.
@@ -130,6 +138,7 @@ def set_regression(
     count: float,
     delay: float,
     shaft: ElasticShaft | None = None,
+    known: bool = False,
 ) -> None:
     """Write a regression's settings.
 
@@ -140,6 +149,7 @@ def set_regression(
         count: One count of the encoder [rad].
         delay: D in periods.
         shaft: What joins rotor and handle. Default: they are one.
+        known: True for a hand whose mass is known.
     """
     regression["period"], regression["resolution"] = period, count
     regression["rotor"] = shaft.rotor if shaft else 0.0
@@ -151,6 +161,8 @@ def set_regression(
     regression["gain"] = gain = _observer_gain(bandwidth, period)
     regression["surprise"][5] = count
     regression["hand_torque"] = HAND_RATE * period / gain[2]
+    regression["growth_left"] = math.exp(-period / _GROWTH_S)
+    regression["growth_followed"] = 0.0 if shaft or known else _GROWTH_FOLLOWED
     walk = 0.0 if shaft else _HAND_RATE_WALK
     regression["hand_change"] = walk * math.sqrt(period) * period / gain[2]
     least_way = _LEAST_WAY * count
@@ -173,7 +185,7 @@ def reset_regression(regression: np.void, y: float) -> None:
     """Begin at rest at y, with nothing known of mass and delay."""
     for name in ("observed", "information", "way", "steady"):
         regression[name] = 0
-    for name in ("begun", "bend", "shaft_torque", "excess"):
+    for name in ("begun", "bend", "shaft_torque", "excess", "growth"):
         regression[name] = 0.0
     regression["excess_spread"] = _PRIOR_EXCESS
     regression["excess_before"] = 1.0 / _PRIOR_EXCESS**2, 0.0
@@ -212,7 +224,7 @@ def begin_regression(regression: Record, y: float, v: float, torque: float) -> N
     regression.observed[0, 0] = regression.load = y - regression.softness * t * t * torque
     for age in range(_RECENT):
         regression.samples[age] = y - age * t * v
-    regression.way = 0.0
+    regression.way = regression.growth = 0.0
     regression.steady = 0
     end_swing(regression.swing[0])
     regression.noise = (_QUANTISATION * regression.resolution) ** 2
@@ -257,6 +269,8 @@ def learn(
     least = _CALM_HAND_RATE / HAND_RATE if calm else 1.0
     if told <= least:
         _note_noise(regression, mass)
+    alone = probed or not np.any(estimator.in_flight)
+    _follow_growth(regression, mass, alone, told <= least)
     if not explained:
         _doubt(regression)
         return True
@@ -354,7 +368,9 @@ def _torque_steps(estimator: Record) -> float:
 @compiled
 def _is_explained(regression: Record, steps: float) -> bool:
     """Return True if there is a mass for which the torque explains the motion."""
-    rest = abs(regression.surprise[0]) - _UNEXPLAINED * math.sqrt(regression.noise)
+    rest = abs(regression.surprise[0] - regression.growth) - _UNEXPLAINED * math.sqrt(
+        regression.noise
+    )
     torque = abs(_torque_surprise(regression)) + _UNTIMELY_MOST * steps
     torque += _FRICTION * abs(regression.surprise[3])
     torque += _UNTIMELY_MOST * steps * regression.softness * regression.lightest
@@ -387,6 +403,22 @@ def _note_noise(regression: Record, mass: float) -> None:
         # What began a few samples ago was taken for an answer to the torque meanwhile.
         _forget(regression, regression.noise / noise)
     regression.noise = noise
+
+
+@compiled
+def _follow_growth(regression: Record, mass: float, alone: bool, quiet: bool) -> None:
+    """Follow how fast the push grows while the handle is alone; forget it slowly afterwards.
+
+    A push that grows under the first torques of the wall would look like mass.
+
+    mass: the one in force. alone: True if no torque but a probe's is in flight. quiet: True if it
+    says nothing.
+    """
+    if not alone:
+        regression.growth *= regression.growth_left
+    elif quiet:
+        rest = regression.surprise[0] + _torque_surprise(regression) / mass - regression.growth
+        regression.growth += regression.growth_followed * rest
 
 
 @compiled
@@ -425,7 +457,7 @@ def _add_information(regression: Record, untimely: float, mass: float) -> None:
     r, information = regression.surprise, regression.information
     weight = 1.0 / (regression.noise + untimely * untimely)
     torque = _torque_surprise(regression)
-    rest = max(abs(r[0] + torque / mass) - _FRICTION / mass * abs(r[3]), 0.0)
+    rest = max(abs(r[0] - regression.growth + torque / mass) - _FRICTION / mass * abs(r[3]), 0.0)
     if weight * rest * rest > _UNEXPLAINED * _UNEXPLAINED:
         _doubt(regression)
     exchanged = min(1.0 - _MEMORY, weight * torque * torque / max(information[1, 1], 1e-300))
@@ -481,7 +513,8 @@ def solve(regression: Record, mass: float, known: bool) -> tuple[float, float]:
     _add_knowledge(normal, 3, (mass / _FRICTION) ** 2, 0.0)
     precision, excess = regression.excess_before[0], regression.excess_before[1]
     _add_knowledge(normal, 4, precision * mass * mass, excess / mass)
-    _add_knowledge(normal, 5, 1.0 / _PRIOR_STEADY**2, 0.0)
+    growth = regression.growth / regression.resolution
+    _add_knowledge(normal, 5, 1.0 / _PRIOR_STEADY**2, -growth)
     _eliminate(normal, 5)
     _eliminate(normal, 3)
     _eliminate(normal, 2)

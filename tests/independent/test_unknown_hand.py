@@ -69,9 +69,12 @@ def test_handle_that_nobody_holds_is_stopped_as_soon_as_by_the_continuous_wall()
     """At K·T²/m = 2: with what the filter was behind of the push it went in 1.8 times as deep."""
     servo = SERVOS["800"]
     bench = Bench(unknown_hand(servo), servo, 0.5)
-    depths, exits = first_strikes(bench, OPERATORS["none"], 200.0, 12)
-    assert max(depths) < 1.55
-    assert max(exits) < 1.0
+    depths, exits = first_strikes(bench, OPERATORS["none"], 200.0, 300)
+    assert max(depths[:12]) < 1.55
+    assert max(depths) < 1.85
+    # Where it is stopped just before the wall, noise decides how its next touch ends.
+    assert np.sum(np.array(exits) > 1.0) <= 2
+    assert max(exits) < 1.2
 
 
 def test_light_hand_that_takes_over_from_an_arm_is_quiet_soon() -> None:

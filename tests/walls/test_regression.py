@@ -121,6 +121,16 @@ def test_push_that_begins_with_the_wall_is_not_mass() -> None:
     assert found == pytest.approx(1.0 / LIGHTEST, rel=0.15)
 
 
+@pytest.mark.parametrize("mass", [1e-4, 1.3e-4, 2.3e-4, 4.2e-4])
+def test_push_that_grows_before_the_wall_is_not_mass(mass: float) -> None:
+    """A hand that pushes harder by 8 N·m/s reaches a wall after 14 ms."""
+    j = np.arange(42)
+    torques = np.zeros(42)
+    torques[36:] = 0.08, 0.32, 0.27, 0.21, 0.21, 0.23
+    found, _ = play(mass, torques, -8.0 * PERIOD * np.clip(j - 22, 0, None))
+    assert found == pytest.approx(1.0 / mass, rel=0.12)
+
+
 def test_latch_of_the_position_is_noise() -> None:
     """A drive that samples up to 0.4 ms late makes the mass less certain, not another one."""
     torques = np.zeros(160)
