@@ -56,8 +56,10 @@ _MEASURING = int(Phase.MEASURING)
 #: A bit for each of the cycles that count as recent.
 _RECENT = (1 << RECENT_CYCLES) - 1
 #: Logarithm of the likelihood ratio at which it is decided if TPDOs have begun to be a cycle late:
-#: at least two samples; and that of a hand whose mass was not known: both models are off then.
-_LAG_EVIDENCE, _LAG_EVIDENCE_OF_UNKNOWN = 15.0, 30.0
+#: at least two samples.
+_LAG_EVIDENCE = 15.0
+#: Share of it that counts in a contact of a hand whose mass was not known: both models are off.
+_LAG_SHARE_OF_UNKNOWN = 0.75
 #: Share of what neither explains that is exchanged with a sample.
 _LAG_NOISE_SHARE = 0.15
 #: Deviation of ln(mass) below which a mass that was not known then is, in spite of the doubt about
@@ -349,22 +351,26 @@ def _go_on_lagging(cycle: Record) -> None:
 
 
 @compiled
-def _compare_lag(cycle: Record) -> None:
-    """Compare the sample with both predictions, and go on with the likelier one in the end."""
+def _compare_lag(cycle: Record, moves: bool) -> None:
+    """Compare the sample with both predictions, and go on with the likelier one in the end.
+
+    moves: True if the sample is another one than the last: a handle that sticks stays where it is,
+    whatever either expects.
+    """
     lagging, losing = cycle.lagging[0], cycle.losing[0]
     probe, estimator = cycle.bank[0].probe[0], cycle.estimator[0]
-    probed = is_probe_in_flight(probe)
-    if not probed or other_torque_acts(probe, estimator.in_flight, estimator.delay_periods):
-        # What a probe alone moves tells who is at the handle, whom neither model knows yet.
+    pressed = other_torque_acts(probe, estimator.in_flight, estimator.delay_periods)
+    # What a probe alone moves tells who is at the handle, whom neither model knows yet.
+    if moves and (pressed or not is_probe_in_flight(probe)):
         square = unexplained(lagging, losing, cycle.oriented)
         cycle.lag_noise += _LAG_NOISE_SHARE * (square - cycle.lag_noise)
-        cycle.lag_evidence += likelier(lagging, losing, cycle.oriented, cycle.lag_noise)
-    decisive = _LAG_EVIDENCE if cycle.keeps_mass else _LAG_EVIDENCE_OF_UNKNOWN
-    if cycle.lag_evidence > decisive:
+        share = _LAG_SHARE_OF_UNKNOWN if pressed and not cycle.keeps_mass else 1.0
+        cycle.lag_evidence += share * likelier(lagging, losing, cycle.oriented, cycle.lag_noise)
+    if cycle.lag_evidence > _LAG_EVIDENCE:
         _go_on_lagging(cycle)
         follow_estimator(cycle.bank[0], lagging)
         cycle.lag += 1
-    if abs(cycle.lag_evidence) > decisive:
+    if abs(cycle.lag_evidence) > _LAG_EVIDENCE:
         cycle.compares_lag = False
     else:
         correct(lagging, cycle.oriented)
@@ -468,7 +474,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     if received:
         compare_position(cycle, cycle.counts - before, missed)
         if cycle.compares_lag:
-            _compare_lag(cycle)
+            _compare_lag(cycle, cycle.counts != before)
         spread = spread_in_force(cycle.bank[0])
         sample = at_sync(cycle.latch[0], estimator, spread, _sync_of_sample(cycle), cycle.oriented)
         correct(estimator, sample)

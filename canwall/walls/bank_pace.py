@@ -17,8 +17,8 @@ from canwall.walls.bank_gains import PACES, QUICKER, SHORTEST_DELAY
 #: that is slow to find the push after a blow makes a heavy hand bounce. After the latter time the
 #: handle is calm.
 _MOVES, _LIVELY_S, _CALM_S = 0.28, 0.05, 0.2
-#: Time for which the samples of a handle that sticks are equal, within which it breaks loose, and
-#: for which it settles after that and after it moved [s]; way by which it breaks loose [counts], and
+#: Times for which samples are equal of a handle that sticks, within which it breaks loose, and for
+#: which it settles after that and after it moved [s]; way by which it breaks loose [counts]; and
 #: paces by which filters are quicker while it settles: a filter at rest lets a heavy handle slip by
 #: several counts before the wall stops it.
 _STICKS_S, _BREAKS_LOOSE_S, _SETTLES_S = 0.016, 0.008, 0.3

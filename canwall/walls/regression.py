@@ -57,8 +57,8 @@ REGRESSION = np.dtype(
         ("surprise", "f8", (6,)),
         ("information", "f8", (6, 6)),  # weighted sums of their products
         ("normal", "f8", (6, 6)),  # the same with what is known before, as it is being solved
-        # Surprise by a push that grows, as found before the wall gives a torque [rad], the share of
-        # a difference by which it follows, and the part of it that is left after a period under one.
+        # Surprise by a push that grows, as found before the wall gives a torque [rad]; the share of
+        # a difference by which it follows; and what is left of it after a period under a torque.
         ("growth", "f8"),
         ("growth_followed", "f8"),
         ("growth_left", "f8"),

@@ -32,6 +32,7 @@ SWING = np.dtype(
         ("lowest", "f8"),
         ("highest", "f8"),
         ("direction", "f8"),  # in which the torque changes; 0: in none up to now
+        ("rests", "i8"),  # samples in a row up to now in which the torque changes in none
         ("way", "f8"),  # of the handle in the half before, from end to end [rad]
         ("halves", "i8"),  # in a row that no hand makes
         ("last", "f8"),  # the last sample [rad]
@@ -43,7 +44,7 @@ SWING = np.dtype(
 
 #: Duration of half a swing [s]: faster than a hand pushes to and fro, and no faster than what the
 #: torque tells of a blow.
-_SHORTEST_S, _LONGEST_S = 0.008, 0.042
+_SHORTEST_S, _LONGEST_S = 0.008, 0.038
 #: Least way of a swing from end to end, between one count and two, and noise of what the observer
 #: does not expect [counts].
 _LEAST_WAY, _NOISE = 1.5, 0.5
@@ -88,7 +89,9 @@ def follow_swing(swing: Record, y: float, position: float, torque: float, turns_
         turns_at: Size of that from which on the torque changes in its direction.
     """
     half, before = swing.half[0], swing.before[0]
-    if half.samples > swing.longest:
+    goes = abs(torque) >= turns_at
+    swing.rests = 0 if goes else swing.rests + 1
+    if swing.rests > swing.longest:
         end_swing(swing)
     if half.samples == 0:
         half.rr = half.rt = half.tt = 0.0
@@ -101,10 +104,10 @@ def follow_swing(swing: Record, y: float, position: float, torque: float, turns_
     half.tt += torque * torque
     half.samples += 1
     swing.lowest, swing.highest = min(swing.lowest, y), max(swing.highest, y)
-    if abs(torque) < turns_at or torque * swing.direction > 0.0:
+    if not goes or torque * swing.direction > 0.0:
         return False
     way = swing.highest - swing.lowest
-    swings = half.samples >= swing.shortest and way >= swing.least_way
+    swings = swing.shortest <= half.samples <= swing.longest and way >= swing.least_way
     swings = swings and swing.stuck <= _STUCK * half.samples
     if swing.direction == 0.0:
         # What goes in a direction from the first sample on may have done so for any time before.

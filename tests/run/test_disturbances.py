@@ -237,13 +237,14 @@ def test_a_contact_of_an_arm_seldom_takes_lost_for_late_or_late_for_lost() -> No
 
 @pytest.mark.parametrize("operator", ["finger", "grip"])
 def test_strikes_on_a_soft_wall_tell_lost_from_late(operator: str) -> None:
-    """Neither model explains a blow in an unknown hand: one that is right by chance is not."""
+    """Neither model explains a blow in an unknown hand: one that is right by chance is not.
+
+    Nor does one that is right while the handle sticks.
+    """
     settings, cycles = strikes_by(operator, **{"wall.stiffness_nm_per_rad": 20.0})
-    told = 0
     for begin in range(250, 1450, 100):
-        told += simulate(settings, cycles, disturbances=late_from(cycles, begin)).lag
+        assert simulate(settings, cycles, disturbances=late_from(cycles, begin)).lag == 1, begin
         assert simulate(settings, cycles, disturbances=lost_at(cycles, begin)).lag == 0, begin
-    assert told >= 10
 
 
 @pytest.mark.parametrize("begin", [247, 298, 332])

@@ -107,11 +107,41 @@ def test_a_heavy_hand_does_not_hunt_friction(delay_error: float) -> None:
     assert _strikes("hand", 0.02, delay_error)["chatters_amplitude"].sum() == 0
 
 
-@pytest.mark.parametrize("operator", ["none", "finger", "grip"])
-def test_hand_that_pushes_to_and_fro_is_no_heavier(operator: str) -> None:
-    """At the upper end of tremor, 10 Hz, by ± 20 mN·m about a steady press."""
+@pytest.mark.parametrize(("stiffness", "speed", "phase"), [(450.0, 0.6, 0.35), (600.0, 0.3, 0.7)])
+def test_torque_on_a_heavy_hand_does_not_creep_until_it_slips(
+    stiffness: float, speed: float, phase: float
+) -> None:
+    """Else the handle sticks for 150 ms, slips by four to six counts, and so on."""
+    point: dict[str, Any] = {"operator": "hand", "law": "mean_force", "model": "drive"}
+    point |= {"servo": "800Hz", "friction": 0.02, "delay_error": -0.3, "press": 1.2}
+    wall = {"wall.stiffness_nm_per_rad": stiffness, "wall.cap": 0.8}
+    settings = config.load(config.shipped("config/sim.toml"), wall)
+    settings = settings_at(settings, point | {"speed": speed, "phase": phase})
+    pressed = simulate(settings.model_copy(update={"schedule": ()}), 1200).rows[400:]
+    assert np.ptp(pressed["torque_cmd"]) < 0.005
+    assert np.ptp(pressed["y"]) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("operator", "speed", "phase"),
+    [
+        ("none", 0.5, 0.0),
+        ("finger", 0.5, 0.0),
+        ("finger", 0.4, 0.2),
+        ("grip", 0.5, 0.0),
+        ("grip", 0.3, 0.6),
+        ("grip", 0.4, 0.2),
+    ],
+)
+def test_hand_that_pushes_to_and_fro_is_no_heavier(
+    operator: str, speed: float, phase: float
+) -> None:
+    """At the upper end of tremor, 10 Hz, by ± 20 mN·m about a steady press.
+
+    It is no swing of the wall, neither as a whole nor in part.
+    """
     point: dict[str, Any] = {"operator": operator, "law": "mean_force", "model": "drive"}
-    point |= {"servo": "1600Hz", "friction": 0.0, "speed": 0.5, "phase": 0.0, "press": 1.2}
+    point |= {"servo": "1600Hz", "friction": 0.0, "speed": speed, "phase": phase, "press": 1.2}
     settings = settings_at(config.load(config.shipped("config/sim.toml")), point)
     assert settings.simulation is not None
     hand = settings.simulation.hand
