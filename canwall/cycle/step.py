@@ -137,8 +137,8 @@ def _set_wall_inputs(cycle: Record, rendered: Record, sample: float, due: bool) 
 @compiled
 def _identify_operator(cycle: Record, sample: float) -> None:
     """Let the bank learn from the sample; the walls' laws get the mass that it finds."""
-    bank, estimator = cycle.bank[0], cycle.estimator[0]
-    set_pace(bank, cycle.rendered[0].wall[0].stiffness)
+    bank, estimator, rendered = cycle.bank[0], cycle.estimator[0], cycle.rendered[0]
+    set_pace(bank, rendered.wall[0].stiffness, cycle.orientation * rendered.position)
     if correct_bank(bank, estimator, sample):
         wall = cycle.rendered[0].wall[0]
         change_plant(wall, estimator.mass, estimator.viscous)

@@ -83,10 +83,12 @@ BANK = np.dtype(
         ("trend_gain", "f8", (MAX_FILTERS,)),
         ("trend_left_pressed", "f8"),
         ("trend_left", "f8"),
-        # Stiffness in force, of the softest wall that counts as stiff, and True if the former does.
+        # Stiffness in force, of the softest wall that counts as stiff, and True if the former does;
+        # position of the wall's surface.
         ("stiffness", "f8"),
         ("stiff_from", "f8"),
         ("stiff", "?"),
+        ("surface", "f8"),
         # Samples since the wall gave a torque, the number from which on that is a flight, and True
         # in the flight of a handle that moves.
         ("alone", "i8"),
@@ -399,20 +401,24 @@ def _hold_torque(bank: Record, estimator: Record, y_sample: float) -> None:
     All filters rest where the wall gives it. Else they would go on creeping, and the torque with
     them until the handle breaks loose: it would hunt.
     """
-    f, stiffness = estimator.in_flight[0], bank.stiffness
+    f, before = estimator.in_flight[0], estimator.in_flight[1]
+    stiffness, surface = bank.stiffness, bank.surface
     count_torque = stiffness * bank.regression[0].resolution
-    if bank.equal < bank.holds_from or abs(f - bank.held) > _STEADY_TORQUE * count_torque:
+    # In every cycle: the wall may have become another one, or have moved.
+    of_wall = f != 0.0 and abs(f + stiffness * (y_sample - surface)) <= count_torque
+    if bank.equal < bank.holds_from or not of_wall:
         bank.held = 0.0
-    if bank.equal < bank.holds_from or stiffness <= 0.0 or f == 0.0:
         return
+    slack = _STEADY_TORQUE * count_torque
+    if bank.held == 0.0 or abs(f - bank.held) > slack:
+        bank.held = f if abs(f - before) <= slack else 0.0
     if bank.held == 0.0:
-        steady = abs(f - estimator.in_flight[1]) <= _STEADY_TORQUE * count_torque
-        if not steady or abs(f + stiffness * y_sample) > count_torque:
-            return
-        bank.held = f
+        return
+    rest = surface - bank.held / stiffness
+    push = bank.spring * rest - bank.held
     for i in range(bank.count):
-        bank.state[0, i], bank.state[1, i] = -bank.held / stiffness, 0.0
-        bank.state[2, i], bank.trend[i] = -bank.held, 0.0
+        bank.state[0, i], bank.state[1, i] = rest, 0.0
+        bank.state[2, i], bank.trend[i] = push, 0.0
 
 
 @compiled

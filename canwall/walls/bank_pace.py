@@ -68,12 +68,13 @@ def note_rest(bank: Record, y_sample: float) -> None:
 
 
 @compiled
-def set_pace(bank: Record, stiffness: float) -> None:
-    """Make the filters as quick as handle and stiffness want, and note if the wall is stiff.
+def set_pace(bank: Record, stiffness: float, surface: float = 0.0) -> None:
+    """Make the filters as quick as handle and stiffness want, and note the wall in force.
 
-    To be called before `correct_bank`.
+    To be called before `correct_bank`. surface: position of the wall's surface [rad].
     """
     regression = bank.regression[0]
+    bank.surface = surface
     bank.stiffness, bank.stiff = stiffness, stiffness >= bank.stiff_from
     if abs(regression.way) >= _MOVES * regression.period:
         bank.moved = 0

@@ -173,6 +173,44 @@ def test_change_is_in_force_from_the_cycle_that_it_is_told(
     assert loop.record["torque_limit"][0] == 1.5
 
 
+@pytest.mark.parametrize(
+    ("position", "change"),
+    [
+        (0.0, "stiffness_nm_per_rad=3"),
+        (0.002, "stiffness_nm_per_rad=20"),
+        (0.002, "wall.position_rad=-0.004"),
+    ],
+)
+def test_change_under_a_handle_that_sticks(
+    make_rig: RigFactory, tmp_path: Path, position: float, change: str
+) -> None:
+    """The torque that is held there is that of the wall before: it says no more where y is."""
+    wall = {"wall.stiffness_nm_per_rad": 12.5, "wall.position_rad": position}
+    settings = config.load(config.shipped("config/sim.toml"), wall)
+    loop = Loop(make_rig(settings.model_copy(update={"schedule": ()})))
+    folder = RunFolder(tmp_path)
+    folder.config.write_text(settings.to_toml())
+    senders: list[threading.Thread] = []
+    held: list[float] = []
+
+    def at(j: int) -> bool:
+        if j == 700:
+            held.append(float(loop.record["bank"]["held"][0, 0]))
+            senders.append(threading.Thread(target=post_change, args=(folder, [change])))
+            senders[-1].start()
+            wait_for(lambda: bool(loop.axis.offers))
+        return False
+
+    with open_to_changes([loop.axis], [folder], loop.exchange, Outcome()):
+        outcome = loop.run(900, at)
+    senders[0].join()
+    assert held[0] > 0.2
+    assert outcome.trips == []
+    rows = loop.rows()
+    count = loop.record["rad_per_count"][0]
+    assert np.abs(rows["y_est"] - rows["y"])[690:704].max() < count
+
+
 @pytest.mark.slow
 def test_run_of_the_command_is_changed_by_the_command(start: Start, tmp_path: Path) -> None:
     embedded = {
