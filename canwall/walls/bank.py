@@ -178,8 +178,9 @@ BANK = np.dtype(
     align=True,
 )
 
-#: Change of a torque in a period up to which it may be held, over that by a count.
-_STEADY_TORQUE = 0.1
+#: Change of a torque in a period up to which it may be held, over that by a count, and distance
+#: from the wall's torque up to which it goes on being held [counts].
+_STEADY_TORQUE, _HELD_COUNTS = 0.1, 2.0
 #: Share of its gain within which the estimator has nearly settled: meanwhile nothing is identified.
 _NEARLY_SETTLED = 0.01
 #: Time without torque after which another hand may be at the handle [s].
@@ -404,8 +405,9 @@ def _hold_torque(bank: Record, estimator: Record, y_sample: float) -> None:
     f, before = estimator.in_flight[0], estimator.in_flight[1]
     stiffness, surface = bank.stiffness, bank.surface
     count_torque = stiffness * bank.regression[0].resolution
-    # In every cycle: the wall may have become another one, or have moved.
-    of_wall = f != 0.0 and abs(f + stiffness * (y_sample - surface)) <= count_torque
+    # In every cycle, since the wall may have become another one, or have moved.
+    within = count_torque if bank.held == 0.0 else _HELD_COUNTS * count_torque
+    of_wall = f != 0.0 and abs(f + stiffness * (y_sample - surface)) <= within
     if bank.equal < bank.holds_from or not of_wall:
         bank.held = 0.0
         return

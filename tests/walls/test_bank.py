@@ -652,6 +652,7 @@ def test_no_filter_leaves_a_handle_at_rest(stiffness: float) -> None:
     """Bounded by the covariance of another gain, some diverge within a second."""
     bank, estimator = bank_at(0.0)
     set_pace(bank[0], stiffness)
+    bank["holds_from"] = 10_000  # no wall gives these torques
     bank["state"][0, 1] = 0.05  # it has just come to rest
     for j in range(2000):
         torque = 0.1 + 0.02 * math.sin(0.05 * j)
