@@ -405,7 +405,10 @@ def test_folder_that_cannot_be_made(tmp_path: Path) -> None:
 def test_command_over_unixcan(start: Start, tmp_path: Path) -> None:
     file = config_file(
         tmp_path / "c.toml",
-        {'channel = "/tmp/canwall.sock"': f'channel = "{tmp_path / "bus"}"'},
+        {
+            'channel = "/tmp/canwall.sock"': f'channel = "{tmp_path / "bus"}"',
+            "[drive]": "[drive]\nsdo_timeout_s = 10.0",  # other tests run beside this one
+        },
         config.shipped("config/unixcan.toml"),
     )
     drive = start(COMMAND, "drive", file)
