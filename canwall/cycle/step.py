@@ -110,6 +110,12 @@ def read_inputs(cycles: NDArray[np.void], data: int) -> None:
 
 
 @compiled
+def _surface(cycle: Record, rendered: Record) -> float:
+    """Return the position of the surface on the drive's axis, oriented towards the wall [rad]."""
+    return cycle.orientation * rendered.position
+
+
+@compiled
 def _set_wall_inputs(cycle: Record, rendered: Record, sample: float, due: bool) -> None:
     """Set position, velocity and bias force relative to the wall.
 
@@ -118,7 +124,7 @@ def _set_wall_inputs(cycle: Record, rendered: Record, sample: float, due: bool) 
     sample.
     """
     wall, estimator = rendered.wall[0], cycle.estimator[0]
-    origin = cycle.orientation * rendered.position
+    origin = _surface(cycle, rendered)
     wall.y_sample = sample - origin
     rendered.elapsed += cycle.period
     if due:
@@ -138,9 +144,9 @@ def _set_wall_inputs(cycle: Record, rendered: Record, sample: float, due: bool) 
 def _identify_operator(cycle: Record, sample: float) -> None:
     """Let the bank learn from the sample; the walls' laws get the mass that it finds."""
     bank, estimator, rendered = cycle.bank[0], cycle.estimator[0], cycle.rendered[0]
-    set_pace(bank, rendered.wall[0].stiffness, cycle.orientation * rendered.position)
+    wall = rendered.wall[0]
+    set_pace(bank, wall.stiffness, _surface(cycle, rendered))
     if correct_bank(bank, estimator, sample):
-        wall = cycle.rendered[0].wall[0]
         change_plant(wall, estimator.mass, estimator.viscous)
         wall.stiffest = stiffest(bank)
         if cycle.fade_left > 0:
@@ -151,7 +157,7 @@ def _identify_operator(cycle: Record, sample: float) -> None:
             take_over(bank, cycle.lagging[0])
             take_over(bank, cycle.losing[0])
             cycle.keeps_mass = 0.0 < bank.spread < _WELL_KNOWN_SPREAD
-    cycle.rendered[0].wall[0].doubt = doubt(bank)
+    wall.doubt = doubt(bank)
 
 
 @compiled
@@ -466,7 +472,7 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
         cycle.guard[0],
         cycle.j,
         cycle.oriented,
-        cycle.orientation * rendered.position,
+        _surface(cycle, rendered),
         cycle.force_applied,
         received and cycle.phase == _RENDERING,
     )
