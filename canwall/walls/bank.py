@@ -2,8 +2,9 @@
 
 State and model in force are interpolated between the two filters next to the mass that a regression
 finds (`regression`), at the delay that it finds. The gains of the filters are made beforehand
-(`bank_gains`); stiffness and motion decide which of them are in force (`bank_pace`). Those of light
-hands also follow how fast the push changes (`bank_trend`). Coulomb friction is left to the bias
+(`bank_gains`); stiffness and motion decide which of them are in force (`bank_pace`). A handle that
+sticks is known to rest (`bank_rest`). The filters of light hands also follow how fast the push
+changes (`bank_trend`). Coulomb friction is left to the bias
 force d̂ (docs/laws.md). A hand that is known has a bank of one filter: it holds its mass, and finds
 the delay.
 
@@ -19,12 +20,8 @@ from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
 from canwall.walls.bank_gains import PACES, QUICKER, STEADIEST, set_filters, stiffest_walls
-from canwall.walls.bank_pace import (
-    is_lively,
-    note_rest,
-    reset_rest,
-    set_rest,
-)
+from canwall.walls.bank_pace import is_lively
+from canwall.walls.bank_rest import bound_velocity, hold_torque, note_rest, reset_rest, set_rest
 from canwall.walls.bank_trend import (
     correct_in_flight,
     follow_trend,
@@ -178,9 +175,6 @@ BANK = np.dtype(
     align=True,
 )
 
-#: Change of a torque in a period up to which it may be held, over that by a count, and distance
-#: from the wall's torque up to which it goes on being held [counts].
-_STEADY_TORQUE, _HELD_COUNTS = 0.1, 2.0
 #: Share of its gain within which the estimator has nearly settled: meanwhile nothing is identified.
 _NEARLY_SETTLED = 0.01
 #: Time without torque after which another hand may be at the handle [s].
@@ -309,8 +303,8 @@ def correct_bank(bank: Record, estimator: Record, y_sample: float) -> bool:
         if follows:
             follow_trend(bank, i, bank.trend_gain[i] * gain[2, i] * (near + far))
     note_rest(bank, y_sample)
-    _bound_velocity(bank)
-    _hold_torque(bank, estimator, y_sample)
+    bound_velocity(bank)
+    hold_torque(bank, estimator, y_sample)
     changed = _identify(bank, estimator, y_sample)
     changed |= _follow_delay(bank, estimator)
     estimator.y, estimator.v = _in_force(bank, state[0]), _in_force(bank, state[1])
@@ -372,55 +366,6 @@ def _set_share(bank: Record, share: float) -> None:
         for i in range(bank.count):
             bank.older[k, i] = older[0, k, i] + share * (older[1, k, i] + share * older[2, k, i])
             bank.newer[k, i] = newer[0, k, i] + share * (newer[1, k, i] + share * newer[2, k, i])
-
-
-@compiled
-def _bound_velocity(bank: Record) -> None:
-    """Let no filter move faster than equal samples allow: by a count each way meanwhile.
-
-    Stiction is in no model: a filter would have a handle that sticks creep under the wall's force,
-    until its bias force has followed, and the wall would push until it breaks loose. Its state is
-    projected onto the bound with its covariance (Simon, IET Control Theory Appl. 4, 2010).
-    """
-    if bank.equal == 0:
-        return
-    regression, state, also = bank.regression[0], bank.state, bank.with_velocity
-    fastest = 2.0 * regression.resolution / (bank.equal * regression.period)
-    for i in range(bank.count):
-        if bank.equal < bank.equal_samples[i]:
-            continue
-        excess = min(max(state[1, i], -fastest), fastest) - state[1, i]
-        state[0, i] += also[0, i] * excess
-        state[1, i] += excess
-        state[2, i] += also[1, i] * excess
-
-
-@compiled
-def _hold_torque(bank: Record, estimator: Record, y_sample: float) -> None:
-    """Hold the torque of a handle that sticks, once it is that of the wall within a count.
-
-    All filters rest where the wall gives it. Else they would go on creeping, and the torque with
-    them until the handle breaks loose: it would hunt.
-    """
-    f, before = estimator.in_flight[0], estimator.in_flight[1]
-    stiffness, surface = bank.stiffness, bank.surface
-    count_torque = stiffness * bank.regression[0].resolution
-    # In every cycle, since the wall may have become another one, or have moved.
-    within = count_torque if bank.held == 0.0 else _HELD_COUNTS * count_torque
-    of_wall = f != 0.0 and abs(f + stiffness * (y_sample - surface)) <= within
-    if bank.equal < bank.holds_from or not of_wall:
-        bank.held = 0.0
-        return
-    slack = _STEADY_TORQUE * count_torque
-    if bank.held == 0.0 or abs(f - bank.held) > slack:
-        bank.held = f if abs(f - before) <= slack else 0.0
-    if bank.held == 0.0:
-        return
-    rest = surface - bank.held / stiffness
-    push = bank.spring * rest - bank.held
-    for i in range(bank.count):
-        bank.state[0, i], bank.state[1, i] = rest, 0.0
-        bank.state[2, i], bank.trend[i] = push, 0.0
 
 
 @compiled
