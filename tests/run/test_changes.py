@@ -19,7 +19,7 @@ from commands import (
     config_file,
     wait_for,
 )
-from rig import Loop, RigFactory, settings_with
+from rig import IDEAL_CONFIG, Loop, RigFactory, settings_with
 
 from canwall import config
 from canwall.config import ConfigError, WallChange
@@ -173,44 +173,6 @@ def test_change_is_in_force_from_the_cycle_that_it_is_told(
     assert loop.record["torque_limit"][0] == 1.5
 
 
-@pytest.mark.parametrize(
-    ("position", "change"),
-    [
-        (0.0, "stiffness_nm_per_rad=3"),
-        (0.002, "stiffness_nm_per_rad=20"),
-        (0.002, "wall.position_rad=-0.004"),
-    ],
-)
-def test_change_under_a_handle_that_sticks(
-    make_rig: RigFactory, tmp_path: Path, position: float, change: str
-) -> None:
-    """The torque that is held there is that of the wall before: it says no more where y is."""
-    wall = {"wall.stiffness_nm_per_rad": 12.5, "wall.position_rad": position}
-    settings = config.load(config.shipped("config/sim.toml"), wall)
-    loop = Loop(make_rig(settings.model_copy(update={"schedule": ()})))
-    folder = RunFolder(tmp_path)
-    folder.config.write_text(settings.to_toml())
-    senders: list[threading.Thread] = []
-    held: list[float] = []
-
-    def at(j: int) -> bool:
-        if j == 700:
-            held.append(float(loop.record["bank"]["held"][0, 0]))
-            senders.append(threading.Thread(target=post_change, args=(folder, [change])))
-            senders[-1].start()
-            wait_for(lambda: bool(loop.axis.offers))
-        return False
-
-    with open_to_changes([loop.axis], [folder], loop.exchange, Outcome()):
-        outcome = loop.run(900, at)
-    senders[0].join()
-    assert held[0] > 0.2
-    assert outcome.trips == []
-    rows = loop.rows()
-    count = loop.record["rad_per_count"][0]
-    assert np.abs(rows["y_est"] - rows["y"])[690:704].max() < count
-
-
 @pytest.mark.slow
 def test_run_of_the_command_is_changed_by_the_command(start: Start, tmp_path: Path) -> None:
     embedded = {
@@ -247,9 +209,14 @@ class Bench:
     """A run that is open to changes, and a person who asks for them."""
 
     def __init__(
-        self, make_rig: RigFactory, path: Path, values: dict[str, Any], **wall: Any
+        self,
+        make_rig: RigFactory,
+        path: Path,
+        values: dict[str, Any],
+        source: Path = IDEAL_CONFIG,
+        **wall: Any,
     ) -> None:
-        settings = settings_with(values)
+        settings = config.load(source, values)
         of_wall = settings.wall.model_copy(update=wall)
         self.settings = settings.model_copy(update={"schedule": (), "wall": of_wall})
         self.loop = Loop(make_rig(self.settings))
@@ -323,6 +290,34 @@ def test_change_that_the_wall_in_force_does_not_allow_is_refused(
     assert bench.answers[:2] == [300, 400]
     assert message in str(bench.answers[2])
     assert bench.answers[3:] == [600]
+
+
+@pytest.mark.parametrize(
+    ("position", "change"),
+    [
+        (0.0, "stiffness_nm_per_rad=3"),
+        (0.002, "stiffness_nm_per_rad=20"),
+        (0.002, "wall.position_rad=-0.004"),
+    ],
+)
+def test_change_under_a_handle_that_sticks(
+    make_rig: RigFactory, tmp_path: Path, position: float, change: str
+) -> None:
+    """The torque that is held there is that of the wall before: it says no more where y is."""
+    wall = {"wall.stiffness_nm_per_rad": 12.5, "wall.position_rad": position}
+    bench = Bench(make_rig, tmp_path, wall, config.shipped("config/sim.toml"))
+    held: list[float] = []
+
+    def ask() -> None:
+        held.append(float(bench.loop.record["bank"]["held"][0, 0]))
+        bench.ask(change)
+
+    assert bench.run({700: ask}).trips == []
+    assert bench.answers == [700]
+    assert held[0] > 0.2
+    rows = bench.loop.rows()
+    count = bench.loop.record["rad_per_count"][0]
+    assert np.abs(rows["y_est"] - rows["y"])[690:704].max() < count
 
 
 def test_divider_is_judged_as_that_of_a_configuration(make_rig: RigFactory, tmp_path: Path) -> None:
