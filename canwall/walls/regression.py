@@ -69,6 +69,9 @@ REGRESSION = np.dtype(
         ("hand_change", "f8"),  # by how much that surprise changes until the next sample
         ("samples", "f8", (_RECENT,)),  # the last ones, newest first [rad]
         ("way", "f8"),  # of a sample, the mean of the last ones [rad]
+        # The longest of late, without sign, and what is left of it after a period.
+        ("longest_way", "f8"),
+        ("way_left", "f8"),
         ("way_samples", "i8"),  # their number
         ("steady", "i8"),  # samples since the handle stuck, or turned on an elastic shaft
         ("moving", "i8"),  # their number from which on the handle moves
@@ -93,10 +96,13 @@ _LEAST_WAY, _CALM_LEAST_WAY = 1.5, 0.9
 _TOLD_FROM_REST = 0.072
 #: Fastest change of a hand's force, and that of a hand which has been calm [N·m/s]. A torque that
 #: changes no faster may be its answer to the hand, and then says nothing of the mass: a wall that
-#: gives way to none looks heavy. With a calm hand the slower one holds where the torque rises: one
-#: that withdraws still may be fast, but an arm on a wall with a finger's mass in its model swings,
-#: and at first more slowly than a hand may push.
+#: gives way to none looks heavy. The slower one holds where the torque rises: a calm hand that
+#: withdraws may be fast, but an arm on a wall with a finger's mass in its model swings, and at
+#: first more slowly than a hand may push.
 HAND_RATE, _CALM_HAND_RATE = 8.0, 1.0
+#: Stiffness of a firm grip at the handle [N·m/rad], 800 N/m at 80 mm: stopped by the wall, a hand
+#: pushes the harder, the faster it came. Time constant with which that speed is forgotten [s].
+_HAND_STIFFNESS, _SPEED_S = 5.0, 0.2
 #: Mass over the one in force from which on a swing tells of another hand, and rate of the torque
 #: from which on it goes to or fro [N·m/s]. Below it noise makes turns; the higher it is, the louder
 #: a swing is when it tells.
@@ -162,6 +168,7 @@ def set_regression(
     regression["surprise"][5] = count
     regression["hand_torque"] = HAND_RATE * period / gain[2]
     regression["growth_left"] = math.exp(-period / _GROWTH_S)
+    regression["way_left"] = math.exp(-period / _SPEED_S)
     regression["growth_followed"] = 0.0 if shaft or known else _GROWTH_FOLLOWED
     walk = 0.0 if shaft else _HAND_RATE_WALK
     regression["hand_change"] = walk * math.sqrt(period) * period / gain[2]
@@ -183,7 +190,7 @@ def _observer_gain(bandwidth: float, period: float) -> NDArray[np.float64]:
 
 def reset_regression(regression: np.void, y: float) -> None:
     """Begin at rest at y, with nothing known of mass and delay."""
-    for name in ("observed", "information", "way", "steady"):
+    for name in ("observed", "information", "way", "longest_way", "steady"):
         regression[name] = 0
     for name in ("begun", "bend", "shaft_torque", "excess", "growth"):
         regression[name] = 0.0
@@ -266,7 +273,7 @@ def learn(
     _let_push_change(regression, mass)
     _follow_swing(regression, estimator, y_sample, mass, calm)
     told = abs(_torque_surprise(regression)) / regression.hand_torque
-    least = _CALM_HAND_RATE / HAND_RATE if calm else 1.0
+    least = _share_of_hand_rate(regression, calm)
     if told <= least:
         _note_noise(regression, mass)
     alone = probed or not np.any(estimator.in_flight)
@@ -356,6 +363,13 @@ def torque_rises(regression: Record, estimator: Record) -> bool:
 
 
 @compiled
+def _share_of_hand_rate(regression: Record, calm: bool) -> float:
+    """Return the part of HAND_RATE at which a hand may push that is calm, or came as this one."""
+    speed = 0.0 if calm else regression.longest_way / regression.period
+    return min((_CALM_HAND_RATE + _HAND_STIFFNESS * speed) / HAND_RATE, 1.0)
+
+
+@compiled
 def _torque_steps(estimator: Record) -> float:
     """Return the sum of the last two steps of the torque that acted, without sign [N·m]."""
     steps = 0.0
@@ -388,6 +402,7 @@ def _note_way(regression: Record, y_sample: float, explained: bool, least_way: f
         goes_on = max(abs(way), abs(regression.way)) >= least
     regression.steady = regression.steady + 1 if goes_on and explained else 0
     regression.way = way
+    regression.longest_way = max(abs(way), regression.way_left * regression.longest_way)
     for age in range(_RECENT - 1, 0, -1):
         regression.samples[age] = regression.samples[age - 1]
     regression.samples[0] = y_sample

@@ -68,6 +68,21 @@ def test_blow_on_a_stiff_wall_is_not_taken_for_a_push() -> None:
     assert sum(each["chatters"] for each in found) == 0
 
 
+@pytest.mark.parametrize("delay_error", [0.0, 0.15])
+def test_slow_arm_on_a_light_rotor_is_not_thrown(delay_error: float) -> None:
+    """Its torque changes more slowly than a hand may push, but not than one that came so slowly.
+
+    With a fingertip's mass in its model the wall would throw the arm out 1.5 times as fast.
+    """
+    settings = config.load(config.shipped("config/sim.toml"), {"simulation.inertia_kg_m2": 2.5e-5})
+    axes = {"law": "mean_force", "model": "drive", "servo": "800Hz", "operator": "arm"}
+    axes |= {"friction": 0.0, "delay_error": delay_error, "press": 1.2}
+    strike = {"speed": 0.241, "phase": 0.136, "stiffness": 40.8}
+    plan = make_plan(settings.model_copy(update={"sweep": {}}), axes | strike)
+    found = plan.prepare(plan.points[0], plan.strikes[0]).on(40.8, 0.0)
+    assert found["restitution"] < 1.0
+
+
 @pytest.mark.parametrize("delay_error", [-0.3, 0.0, 0.15])
 @pytest.mark.parametrize("operator", ["fingertip", "finger", "grip", "hand", "arm"])
 def test_known_hand_is_no_worse_than_an_unknown_one(operator: str, delay_error: float) -> None:

@@ -46,12 +46,20 @@ def send(regression: NDArray[np.void], estimator: NDArray[np.void], torque: floa
 
 
 def play(
-    mass: float, torques: Array, push: Array, jitter: float = 0.0, calm: bool = False
+    mass: float,
+    torques: Array,
+    push: Array,
+    jitter: float = 0.0,
+    calm: bool = False,
+    speed: float = 0.5,
 ) -> tuple[float, float]:
-    """Return 1/m and its deviation after torques that act at once, beside a hand's push."""
+    """Return 1/m and its deviation after torques that act at once, beside a hand's push.
+
+    speed: that of approach [rad/s].
+    """
     regression, estimator = made(), np.zeros(1, ESTIMATOR)
     rng = np.random.default_rng(1)
-    y, v, known = 0.0, -0.5, LIGHTEST
+    y, v, known = 0.0, -speed, LIGHTEST
     for torque, pushed in zip(torques.tolist(), push.tolist(), strict=True):
         sample = COUNT * round((y + jitter * v * rng.uniform(-0.5, 0.5)) / COUNT)
         learn(regression[0], estimator[0], sample, known, calm, False)
@@ -103,10 +111,11 @@ def test_blow_tells_the_mass(mass: float) -> None:
     assert deviation < (0.65 if mass == LIGHTEST else 0.3) * found
 
 
-def test_torque_that_answers_a_hand_tells_nothing() -> None:
-    """A wall that gives way to none would look heavy."""
-    push = -3.0 * PERIOD * np.arange(100)
-    found, deviation = play(4e-4, -push, push)
+@pytest.mark.parametrize(("rate", "speed"), [(7.0, 2.5), (2.0, 0.5)])
+def test_torque_that_answers_a_hand_tells_nothing(rate: float, speed: float) -> None:
+    """A wall that gives way to none would look heavy. A hand that came fast may push fast."""
+    push = -rate * PERIOD * np.arange(100)
+    found, deviation = play(4e-4, -push, push, speed=speed)
     # The mean of what there may be before the first torque.
     assert found == pytest.approx(mean_above_zero(1.0 / LIGHTEST, 0.7 / LIGHTEST))
     assert deviation > 0.5 * found
@@ -238,8 +247,19 @@ def test_swing_as_slow_as_a_hand_pushes_tells_the_mass_of_a_calm_hand() -> None:
     push = np.full(300, -0.15)
     found, _ = play(arm, swing, push, calm=True)
     assert 1.5e-3 < 1.0 / found < 1.5 * arm
-    found, _ = play(arm, swing, push)
+    found, _ = play(arm, swing, push, speed=2.0)
     assert 1.0 / found < 1e-3
+
+
+def test_torque_faster_than_a_hand_that_came_slowly_tells_the_mass() -> None:
+    """In a soft wall it never changes as fast as any hand pushes."""
+    torques = np.zeros(60)
+    torques[20:] = 0.2 * np.sin(2.0 * np.pi * 6.0 * PERIOD * np.arange(40))
+    assert np.abs(np.diff(torques)).max() / PERIOD < 8.0
+    (slow, _), (fast, _) = (play(3.6e-3, torques, np.zeros(60), speed=v) for v in (0.3, 2.0))
+    assert 1.0 / slow > 4.0 * LIGHTEST
+    # What there may be before the first torque.
+    assert fast == pytest.approx(mean_above_zero(1.0 / LIGHTEST, 0.7 / LIGHTEST))
 
 
 def test_torque_that_falls_with_a_hand_tells_nothing_of_a_calm_one() -> None:
