@@ -290,6 +290,7 @@ def test_inbox_of_the_hub_is_bounded(join: Join, monkeypatch: pytest.MonkeyPatch
     assert hub.recv(0) is None
 
 
+@pytest.mark.slow
 def test_sender_waits_while_the_hub_is_stopped(channel: Path, join: Join, spawn: Spawn) -> None:
     hub = spawn("-c", HUB, str(channel))
     assert line_of(hub) == "joined"

@@ -385,6 +385,7 @@ def test_every_key_is_explained() -> None:
     assert missing == []
 
 
+@pytest.mark.slow
 @BOUNDED
 @given(
     st.dictionaries(

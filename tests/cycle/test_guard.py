@@ -177,6 +177,7 @@ def cycles_of(settings: Settings) -> int:
     return round(settings.run.duration_s / PERIOD)
 
 
+@pytest.mark.slow
 def test_a_guard_that_only_warns_changes_no_bit() -> None:
     runs = [
         simulate(settings, cycles_of(settings)).rows

@@ -148,6 +148,7 @@ def test_strikes_come_out_as_on_our_own_drive(drive: Drive, make_rig: RigFactory
         assert others[column] == pytest.approx(ours[column], abs=1e-9)
 
 
+@pytest.mark.slow
 def test_run(drive: Drive, tmp_path: Path) -> None:
     """Four strikes through the command, by the name of the configuration: nothing chatters."""
     eds, folder = EDS / drive.eds, tmp_path / "run"

@@ -65,6 +65,7 @@ def assert_same(ours: Any, theirs: Any) -> None:
         assert ours[name][:CYCLES].tolist() == theirs[name][:CYCLES].tolist(), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "overrides",
     [

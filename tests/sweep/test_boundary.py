@@ -85,6 +85,7 @@ def test_ceilings_without_damping_of_the_plant(delay: int) -> None:
     np.testing.assert_array_equal(swings(dataset), [False, True])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", CEILINGS)
 def test_ceilings_are_those_of_the_eigenvalues(delay: int) -> None:
     ceiling, damping = CEILINGS[delay]

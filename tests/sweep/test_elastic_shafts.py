@@ -37,6 +37,7 @@ def test_cap_keeps_every_wall_quiet_on_an_elastic_shaft(model: str, softest: flo
     assert (in_force[1::2] < in_force[::2]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hz", [400.0, 600.0])
 def test_a_handle_that_nobody_holds_comes_to_rest(hz: float) -> None:
     """Without friction nothing but the wall's damper takes the swing of a soft wall."""

@@ -293,6 +293,7 @@ def _quick_to_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "fsync", lambda descriptor: None)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_quick_to_disk")
 def test_a_journal_cut_short_by_a_power_cut_keeps_what_is_whole(tmp_path: Path) -> None:
     output = tmp_path / "a.nc"
@@ -323,6 +324,7 @@ def some_pieces(count: int) -> list[np.ndarray[Any, Any]]:
     return [random.random(8).view([("force", "f8")]) for _ in range(count)]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_quick_to_disk")
 def test_a_damaged_journal_is_never_read_as_data(tmp_path: Path) -> None:
     """Whatever happens to the file: a piece is what was put in, or it is not there."""
