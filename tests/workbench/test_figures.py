@@ -31,6 +31,9 @@ from canwall.workbench.figures import Extent, write_figures
 from canwall.workbench.on_the_drive import effort, record_run
 from canwall.workbench.traces import BALL, POINTS, drop_ball
 
+# All figures are drawn once, for the whole file.
+pytestmark = pytest.mark.slow
+
 Array = NDArray[np.float64]
 
 EXTENT = Extent(long_s=120.0, drops=4, phases=6, thetas=4, plane=3)
@@ -91,7 +94,6 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
     return Written(folder, path.read_text(encoding="utf-8"), figures, steps)
 
 
-@pytest.mark.slow
 def test_every_figure_has_its_files_and_nothing_else_is_left(written: Written) -> None:
     expected = {f"{name}.{kind}" for name in NAMES for kind in ("png", "csv")} | {"index.md"}
     expected |= {f"{name}.png" for name in DIAGRAMS}
@@ -327,7 +329,6 @@ def test_displayed_effort_of_figure_5_19_belongs_to_the_sample_before(written: W
     np.testing.assert_allclose(shown[1:], np.minimum(y[:-1], 0.0), rtol=0, atol=half_step + 1e-9)
 
 
-@pytest.mark.slow
 def test_effort_not_displayed_is_the_laws_own() -> None:
     recorded = record_run()
     settings = recorded.settings
