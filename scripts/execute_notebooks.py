@@ -1,4 +1,4 @@
-"""Execute the notebooks in docs/notebooks and keep what comes out, but what differs each time."""
+"""Execute the notebooks in docs/notebooks and write them back, without what differs each time."""
 
 import argparse
 import tempfile

@@ -4,9 +4,8 @@ State and model in force are interpolated between the two filters next to the ma
 finds (`regression`), at the delay that it finds. The gains of the filters are made beforehand
 (`bank_gains`); stiffness and motion decide which of them are in force (`bank_pace`). A handle that
 sticks is known to rest (`bank_rest`). The filters of light hands also follow how fast the push
-changes (`bank_trend`). Coulomb friction is left to the bias
-force d̂ (docs/laws.md). A hand that is known has a bank of one filter: it holds its mass, and finds
-the delay.
+changes (`bank_trend`). Coulomb friction is left to the bias force d̂ (docs/laws.md). A hand that is
+known has a bank of one filter: it holds its mass, and finds the delay.
 
 The bank works on an estimator in its steady state and hands over state and model to it. In a gap
 of samples, and until the estimator has nearly settled again, the estimator goes on alone and the

@@ -69,10 +69,10 @@ REGRESSION = np.dtype(
         ("hand_change", "f8"),  # by how much that surprise changes until the next sample
         ("samples", "f8", (_RECENT,)),  # the last ones, newest first [rad]
         ("way", "f8"),  # of a sample, the mean of the last ones [rad]
-        # The longest of late, without sign, and what is left of it after a period.
+        ("way_samples", "i8"),  # their number
+        # The longest way of late, without sign, and what is left of it after a period.
         ("longest_way", "f8"),
         ("way_left", "f8"),
-        ("way_samples", "i8"),  # their number
         ("steady", "i8"),  # samples since the handle stuck, or turned on an elastic shaft
         ("moving", "i8"),  # their number from which on the handle moves
     ],

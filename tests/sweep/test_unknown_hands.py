@@ -44,6 +44,13 @@ def _strikes(
     return np.concatenate([plan.prepare(point, strike).on_all(walls) for strike in plan.strikes])
 
 
+def _strike(keys: dict[str, float], axes: dict[str, Any]) -> np.void:
+    """Return the measures of one strike; keys: of the configuration, axes: a value each."""
+    settings = config.load(config.shipped("config/sim.toml"), keys)
+    plan = make_plan(settings.model_copy(update={"sweep": {}}), axes)
+    return plan.prepare(plan.points[0], plan.strikes[0]).on(axes["stiffness"], 0.0)
+
+
 @pytest.mark.parametrize("delay_error", [0.0, 0.15])
 @pytest.mark.parametrize("operator", ["fingertip", "finger", "grip"])
 def test_cap_keeps_every_wall_quiet_in_a_light_hand(operator: str, delay_error: float) -> None:
@@ -74,13 +81,10 @@ def test_slow_arm_on_a_light_rotor_is_not_thrown(delay_error: float) -> None:
 
     With a fingertip's mass in its model the wall would throw the arm out 1.5 times as fast.
     """
-    settings = config.load(config.shipped("config/sim.toml"), {"simulation.inertia_kg_m2": 2.5e-5})
     axes = {"law": "mean_force", "model": "drive", "servo": "800Hz", "operator": "arm"}
     axes |= {"friction": 0.0, "delay_error": delay_error, "press": 1.2}
-    strike = {"speed": 0.241, "phase": 0.136, "stiffness": 40.8}
-    plan = make_plan(settings.model_copy(update={"sweep": {}}), axes | strike)
-    found = plan.prepare(plan.points[0], plan.strikes[0]).on(40.8, 0.0)
-    assert found["restitution"] < 1.0
+    axes |= {"speed": 0.241, "phase": 0.136, "stiffness": 40.8}
+    assert _strike({"simulation.inertia_kg_m2": 2.5e-5}, axes)["restitution"] < 1.0
 
 
 @pytest.mark.parametrize("delay_error", [-0.3, 0.0, 0.15])
@@ -92,15 +96,13 @@ def test_known_hand_is_no_worse_than_an_unknown_one(operator: str, delay_error: 
 
 def test_known_hand_s_wall_is_as_stiff_as_encoder_and_delay_bear() -> None:
     """2.2 N a count at 80 mm, and 0.83·(1.85/D)⁵·m/T² at D = 2, 0.35 of the servo and 0.1."""
-    settings = config.load(config.shipped("config/sim.toml"), {"wall.cap": 1.0})
     strike = {"law": "mean_force", "model": "matched", "servo": "1600Hz", "operator": "arm"}
     strike |= {"friction": 0.0, "speed": 0.5, "phase": 0.0, "press": 1.2, "stiffness": 5000.0}
     for axes, stiffest in (
         ({"counts": 10_000}, 2.2 * 0.08 * 10_000 / (2.0 * np.pi)),
         ({"delay": 2.0}, 0.83 * (1.85 / 2.45) ** 5 * 3.62e-3 / 1e-6),
     ):
-        plan = make_plan(settings.model_copy(update={"sweep": {}}), strike | axes)
-        found = plan.prepare(plan.points[0], plan.strikes[0]).on(5000.0, 0.0)
+        found = _strike({"wall.cap": 1.0}, strike | axes)
         assert found["stiffness_in_force"] == pytest.approx(stiffest, rel=2e-3)
 
 
