@@ -31,6 +31,7 @@ from canwall.walls.bank_trend import (
     trend_left,
 )
 from canwall.walls.estimator import MAX_DELAY, set_model, set_model_delay, settle_within
+from canwall.walls.least_squares import KNOWN_SPREAD, solve
 from canwall.walls.probe import (
     PROBE,
     probe_torque,
@@ -39,7 +40,6 @@ from canwall.walls.probe import (
     set_probe,
 )
 from canwall.walls.regression import (
-    KNOWN_SPREAD,
     OBSERVER_SLOWER_BEHIND_SHAFT,
     REGRESSION,
     begin_regression,
@@ -49,7 +49,6 @@ from canwall.walls.regression import (
     predict_regression,
     reset_regression,
     set_regression,
-    solve,
     torque_rises,
 )
 from canwall.walls.shaft import ElasticShaft

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from canwall.compiled import Record, compiled
 from canwall.walls.estimator import MAX_DELAY, unit_motion
+from canwall.walls.least_squares import FRICTION, PRIOR_EXCESS
 from canwall.walls.shaft import ElasticShaft
 from canwall.walls.swing import SWING, end_swing, follow_swing, lightness_of_swing, set_swing
 
@@ -124,17 +125,8 @@ _SUDDENLY = 1.5
 #: Share of what is known that is left after a sample that tells as much as those before, and after
 #: one that nothing explains: another hand, or a blow.
 _MEMORY, _DOUBTED = 0.98, 0.1
-#: Before the first torque: standard deviation of m₀/m about 1, with m₀ the lightest mass; mean and
-#: standard deviation of b/m [1/s]; standard deviation of what is steady [counts].
-_PRIOR_LIGHTNESS, _PRIOR_RATE, _PRIOR_RATE_DEVIATION, _PRIOR_STEADY = 0.7, 100.0, 300.0, 4.0
-#: Delay beyond the one told, before the first torque: standard deviation, and the most; what is
-#: added to the deviation from one hand to the next [periods].
-_PRIOR_EXCESS, _MOST_EXCESS, _EXCESS_CHANGES = 0.3, 0.5, 0.05
-#: Standard deviation of ln(m) of a hand that is known.
-KNOWN_SPREAD = 0.01
-#: Coulomb friction that there may be: standard deviation, and the most that explains a surprise
-#: [N·m].
-_FRICTION = 0.02
+#: Added to the standard deviation of the delay from one hand to the next [periods].
+_EXCESS_CHANGES = 0.05
 
 
 def set_regression(
@@ -194,8 +186,8 @@ def reset_regression(regression: np.void, y: float) -> None:
         regression[name] = 0
     for name in ("begun", "bend", "shaft_torque", "excess", "growth"):
         regression[name] = 0.0
-    regression["excess_spread"] = _PRIOR_EXCESS
-    regression["excess_before"] = 1.0 / _PRIOR_EXCESS**2, 0.0
+    regression["excess_spread"] = PRIOR_EXCESS
+    regression["excess_before"] = 1.0 / PRIOR_EXCESS**2, 0.0
     regression["observed"][0, 0] = regression["load"] = y
     regression["samples"] = y
     regression["noise"] = (_QUANTISATION * regression["resolution"]) ** 2
@@ -386,7 +378,7 @@ def _is_explained(regression: Record, steps: float) -> bool:
         regression.noise
     )
     torque = abs(_torque_surprise(regression)) + _UNTIMELY_MOST * steps
-    torque += _FRICTION * abs(regression.surprise[3])
+    torque += FRICTION * abs(regression.surprise[3])
     torque += _UNTIMELY_MOST * steps * regression.softness * regression.lightest
     return rest * regression.lightest <= torque
 
@@ -472,7 +464,7 @@ def _add_information(regression: Record, untimely: float, mass: float) -> None:
     r, information = regression.surprise, regression.information
     weight = 1.0 / (regression.noise + untimely * untimely)
     torque = _torque_surprise(regression)
-    rest = max(abs(r[0] - regression.growth + torque / mass) - _FRICTION / mass * abs(r[3]), 0.0)
+    rest = max(abs(r[0] - regression.growth + torque / mass) - FRICTION / mass * abs(r[3]), 0.0)
     if weight * rest * rest > _UNEXPLAINED * _UNEXPLAINED:
         _doubt(regression)
     exchanged = min(1.0 - _MEMORY, weight * torque * torque / max(information[1, 1], 1e-300))
@@ -507,80 +499,6 @@ def _forget(regression: Record, left: float) -> None:
     for i in range(6):
         for c in range(6):
             information[i, c] *= left
-
-
-@compiled
-def solve(regression: Record, mass: float, known: bool) -> tuple[float, float]:
-    """Return 1/m, of the load on an elastic shaft, and its standard deviation; find the delay.
-
-    They are the least squares of r₀ + r₁·(1/m) − r₂·(b/m) − r₃·(f_c/m) + r₄·(δ/m) − r₅·c, with what
-    is known before the first torque; c is what is steady. mass: the one in force, for friction and
-    delay. known: True if it is that of a hand that is known; any error of it is found as delay.
-    """
-    mass -= regression.rotor
-    before, deviation = regression.lightest, _PRIOR_LIGHTNESS
-    if known:
-        before, deviation = mass, KNOWN_SPREAD
-    normal = regression.normal
-    normal[:] = regression.information
-    _add_knowledge(normal, 1, (before / deviation) ** 2, 1.0 / before)
-    _add_knowledge(normal, 2, 1.0 / _PRIOR_RATE_DEVIATION**2, -_PRIOR_RATE)
-    _add_knowledge(normal, 3, (mass / _FRICTION) ** 2, 0.0)
-    precision, excess = regression.excess_before[0], regression.excess_before[1]
-    _add_knowledge(normal, 4, precision * mass * mass, excess / mass)
-    growth = regression.growth / regression.resolution
-    _add_knowledge(normal, 5, 1.0 / _PRIOR_STEADY**2, -growth)
-    _eliminate(normal, 5)
-    _eliminate(normal, 3)
-    _eliminate(normal, 2)
-    told = normal[4, 4]
-    precision = normal[1, 1] - normal[1, 4] * normal[1, 4] / told
-    lightness = -(normal[0, 1] - normal[1, 4] * normal[0, 4] / told) / precision
-    deviation = 1.0 / math.sqrt(precision)
-    if lightness > 0.0 and regression.rotor == 0.0:
-        excess = -(normal[0, 4] + normal[1, 4] * lightness) / (told * lightness)
-        regression.excess = min(max(excess, -_MOST_EXCESS), _MOST_EXCESS)
-        regression.excess_spread = _excess_spread(regression, lightness)
-    return mean_above_zero(lightness, deviation), deviation
-
-
-@compiled
-def _add_knowledge(normal: Record, k: int, precision: float, value: float) -> None:
-    """Add to the normal equations that unknown k has this value."""
-    normal[k, k] += precision
-    normal[0, k] -= precision * value
-    normal[k, 0] = normal[0, k]
-
-
-@compiled
-def _eliminate(normal: Record, k: int) -> None:
-    """Eliminate unknown k from the normal equations of the others."""
-    for i in range(6):
-        share = normal[i, k] / normal[k, k]
-        if i != k:
-            for c in range(6):
-                normal[i, c] -= share * normal[k, c]
-
-
-@compiled
-def _excess_spread(regression: Record, lightness: float) -> float:
-    """Return the standard deviation of the delay, whatever the mass is: of δ in δ·(1/m)."""
-    normal, excess = regression.normal, regression.excess
-    both = normal[1, 4] + excess * normal[4, 4]
-    of_mass = normal[1, 1] + excess * (normal[1, 4] + both)
-    told = max(normal[4, 4] - both * both / of_mass, 0.0) * lightness * lightness
-    return min(1.0 / math.sqrt(max(told, 1e-6)), _PRIOR_EXCESS)
-
-
-@compiled
-def mean_above_zero(mean: float, deviation: float) -> float:
-    """Return the mean of a normal distribution of which only what is above zero is possible."""
-    z = mean / deviation
-    if z < -6.0:
-        return deviation / -z
-    return mean + deviation * math.sqrt(2.0 / math.pi) * math.exp(-0.5 * z * z) / math.erfc(
-        -z / math.sqrt(2.0)
-    )
 
 
 @compiled

@@ -10,17 +10,16 @@ from scipy.stats import truncnorm
 
 from canwall.physics import advance, make_plant
 from canwall.walls import ESTIMATOR, MAX_DELAY
+from canwall.walls.least_squares import mean_above_zero, solve
 from canwall.walls.regression import (
     REGRESSION,
     begin_regression,
     forget_mass,
     learn,
-    mean_above_zero,
     moves,
     predict_regression,
     reset_regression,
     set_regression,
-    solve,
 )
 
 PERIOD, COUNT, LIGHTEST = 1e-3, 4.8e-5, 1e-4

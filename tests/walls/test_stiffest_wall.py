@@ -25,12 +25,12 @@ from canwall.walls import (
     wall_force,
 )
 from canwall.walls.estimator import kalman_model
+from canwall.walls.least_squares import solve
 from canwall.walls.regression import (
     REGRESSION,
     learn,
     reset_regression,
     set_regression,
-    solve,
 )
 from canwall.walls.shaft import closed_loops
 
