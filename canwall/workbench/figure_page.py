@@ -42,7 +42,7 @@ class FigurePage:
     Attributes:
         name: Name of its files.
         title: Title.
-        claim: What the source says of it.
+        claim: What the source says of it, or, of a figure that it does not have, what it shows.
         finding: What the numbers show.
         columns: Plotted data by column name with unit, all of one length; none of a diagram.
         figure: The figure itself.
@@ -70,9 +70,10 @@ class FigurePage:
     def text(self) -> str:
         """Return its section of the index, in Markdown."""
         data = f" ([data]({self.name}.csv))" if self.columns else ""
+        says = "The chapter" if self.name.startswith("figure_") else "Shown"
         return (
             f"## {self.title}\n\n![{self.title}]({self.name}.png)\n\n"
-            f"*The chapter:* {self.claim}\n\n*Here:* {self.finding}{data}\n"
+            f"*{says}:* {self.claim}\n\n*Here:* {self.finding}{data}\n"
         )
 
 

@@ -26,7 +26,7 @@ _STIFFNESS, _SPEED = 300.0, 0.7
 #: Cycles before the contact and after it.
 _BEFORE, _AFTER = 20, 140
 #: Positions that are shown [mrad].
-_SHOWN = (-9.0, 9.0)
+_SHOWN = (-4.5, 3.0)
 _POSITION, _IN_FORCE, _MASS = COLOURS[4], COLOURS[0], COLOURS[3]
 
 
@@ -108,8 +108,9 @@ def draw_unknown_hands() -> Iterator[FigurePage]:
     yield FigurePage(
         "unknown_hands",
         title,
-        "The mass at the handle is learned from its answer to the wall's own torques; the wall "
-        "begins as one for the lightest operator, and is as stiff as the mass allows.",
+        "The wall begins as one for the lightest operator. The mass at the handle is learned from "
+        "its answer to a probe before the contact and to the wall's own torques, and the wall is "
+        "as stiff as it allows.",
         "Mass found of the true one, and stiffness in force, "
         f"{_AFTER} ms after the contact: {'; '.join(found)}.",
         columns,
