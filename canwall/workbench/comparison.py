@@ -151,8 +151,8 @@ def draw_comparison(count: int, phases: int) -> Iterator[FigurePage]:
     yield FigurePage(
         "all_laws",
         "All laws: energy, tension and peak force of a bounce",
-        "As the chapter says, the standard wall puts out energy, the two new controllers hardly any, "
-        "and none with the compensation for asynchronous switching.",
+        "As the chapter says, the standard wall puts out energy, the two new controllers hardly "
+        "any, and none with the compensation for asynchronous switching.",
         _finding(grid, results),
         _columns(grid, results, referents),
         figure,
