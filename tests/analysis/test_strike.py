@@ -69,6 +69,7 @@ def measured(y: Array, force: Array | None = None, **given: Any) -> dict[str, An
     return dict(zip(MEASURES.names or (), measures[0].tolist(), strict=True))
 
 
+@pytest.mark.slow
 def test_every_measure_of_a_strike() -> None:
     y = pressed() + sine(2.0 * COUNT, 25.0)
     force = np.where(y < 0.0, 2.0, 0.0)

@@ -5,6 +5,7 @@ to its end, and each place that calls a function there gets each kind of fault o
 place of the ways out that a failed cycle, a deaf drive and a hanging cycle take.
 """
 
+import gc
 import signal
 import sys
 import threading
@@ -185,6 +186,7 @@ def test_fault_at_every_call(native: bool, kind: str, way: str) -> None:
     others = list(WAYS)[: list(WAYS).index(way)]
     listed = places(way).difference(*map(places, others))
     assert len(listed) > (5 if others else 20)
+    gc.freeze()  # what is loaded by now need not be visited by the collector of each run
     failed: list[Any] = []
     for place in sorted(listed):
         released = threading.Event()

@@ -216,6 +216,7 @@ def test_a_file_that_is_no_sweep(tmp_path: Path, content: bytes | None, line: st
     assert len(done.stderr.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_damping_ratio_stands_where_a_damping_would(tmp_path: Path) -> None:
     settings = settings_with({"wall.damping_ratio": 0.5})
     of_ratio = sweep(make_plan(settings, {**STRIKE, "stiffness": [5.0, 10.0]}), tmp_path / "r.nc")
@@ -229,6 +230,7 @@ def test_damping_ratio_stands_where_a_damping_would(tmp_path: Path) -> None:
     assert "ζ = 0.3" in shared_parameters(of_axis.isel({"wall.damping_ratio": 1}))
 
 
+@pytest.mark.slow
 def test_damping_of_k_limits_is_told(tmp_path: Path, drawn: dict[str, Figure]) -> None:
     given = {**STRIKE, "law": "standard", "rate": [900, 1000], "phase": 0.0}
     for ratio, told, walls in ((0.5, "ζ = 0.5", "alone"), (0.0, "B = 0 N·m·s/rad", "and damper")):
