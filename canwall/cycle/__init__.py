@@ -21,7 +21,7 @@ from canwall.cycle.state import (
     start_at,
     stiffest_for,
 )
-from canwall.cycle.step import step
+from canwall.cycle.step import step, step_address, step_at
 from canwall.cycle.timing import observe_ns
 from canwall.cycle.transport import CycleFrames, Transport
 from canwall.cycle.trip_text import latest_emergency
@@ -69,6 +69,8 @@ __all__ = [
     "set_wall",
     "start_at",
     "step",
+    "step_address",
+    "step_at",
     "stiffest_for",
     "timing_summary",
     "torques_in_force",

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from canwall.bus.raw_socket import CAN_EFF, CAN_ERR, CAN_RTR, elements
 from canwall.compiled import Record, compiled
 from canwall.cycle.state import CYCLE
-from canwall.cycle.step import step
+from canwall.cycle.step import step_at
 from canwall.cycle.timing import observe_ns
 from canwall.cycle.trips import stop
 from canwall.record.append import load_acquire, put_frame, put_row
@@ -104,6 +104,7 @@ DRIVE_FRAMES = np.dtype(
         ("rpdo_id", "i8"),
         ("rpdo_length", "i8"),
         ("constant", "i8"),  # content of a fixed RPDO besides controlword and torque
+        ("step", "u8"),
         ("cycle", "u8"),
         ("row", "u8"),
         ("latency", "u8"),
@@ -417,7 +418,7 @@ def _answer(core: Record, k: int, data: int, received: bool, received_ns: int) -
     cycles, rows = elements(drive.cycle, 1, CYCLE), elements(drive.row, 1, ROW)
     if drive.controls and load_acquire(elements(drive.controls, 1, CONTROLS)[0], "stop"):
         stop(cycles[0])
-    answer = step(cycles, rows, data, received)
+    answer = step_at(drive.step, cycles, rows, data, received)
     if core.retired:
         return _DONE
     core.answered = k

@@ -20,7 +20,7 @@ from canwall.cycle import core as cycle_core
 from canwall.cycle.axis import WallAxis
 from canwall.cycle.core import CORE, DRIVE_FRAMES, INBOX, Handling, Want
 from canwall.cycle.python_can import PythonCanTransport
-from canwall.cycle.step import step
+from canwall.cycle.step import step, step_address
 from canwall.cycle.transport import CycleFrames, TransportFactory
 from canwall.drive import Link, Watchdog
 from canwall.drive.watchdog import ErrorControlFrame
@@ -335,6 +335,7 @@ def _lay_out(axis: WallAxis) -> None:
     drive["tpdo_id"], drive["tpdo_length"] = tpdo.cob_id, tpdo.length
     drive["rpdo_id"], drive["rpdo_length"] = rpdo.cob_id, rpdo.length
     drive["constant"], drive["wrong_length"] = rpdo.constant, -1
+    drive["step"] = step_address()
     for name, array in (
         ("cycle", axis.cycle),
         ("row", axis.row),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from canwall.analysis.felt import felt_body, mean_hand_force
 from canwall.compiled import Record, compiled, copied
 from canwall.config import ConfigError, Settings
-from canwall.cycle import Trip, fade_in, make_cycle, run_laws, start_at, step
+from canwall.cycle import Trip, fade_in, make_cycle, run_laws, start_at, step_address, step_at
 from canwall.drive import DriveSetup, DriveState, Field, PdoLayout
 from canwall.drive import objects as od
 from canwall.physics import HandBody
@@ -118,6 +118,7 @@ class LoopRecords(NamedTuple):
     """A closed loop in the form that compiled code takes; it can be simulated repeatedly.
 
     Attributes:
+        step: Address of the compiled step.
         cycle: Record of the cycle, shape (1,).
         servo: Record of the servo, shape (1,).
         cycle_bytes: The memory of `cycle` as bytes.
@@ -137,6 +138,7 @@ class LoopRecords(NamedTuple):
         strays: SYNCs that are late.
     """
 
+    step: int
     cycle: NDArray[np.void]
     servo: NDArray[np.void]
     cycle_bytes: Bytes
@@ -231,6 +233,7 @@ class ClosedLoop:
         """Return records for a thread of its own; several may simulate the loop at a time."""
         cycle, servo = copied(self._cycle), copied(self._servo)
         return LoopRecords(
+            step_address(),
             cycle,
             servo,
             cycle.view(np.uint8),
@@ -373,7 +376,7 @@ def _run_cycles(loop: LoopRecords, rows: NDArray[np.void], signals: Array) -> in
         data_before = data
         data = (counts & 0xFFFFFFFF) | (_ENABLED << 32) | ((shown & 0xFFFF) << 48)
         taken = data_before if late[j] else data
-        step(cycles, rows[at : at + 1], taken, not loop.lost[j])
+        step_at(loop.step, cycles, rows[at : at + 1], taken, not loop.lost[j])
         # Two TPDOs come in the cycle in which they are late for the last time.
         cycle.overtaken = late[j] and not (j + 1 < len(push) and late[j + 1])
         row: Record = rows[at]
