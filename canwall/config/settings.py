@@ -98,10 +98,10 @@ class Wall(Section):
     """`[wall]`: position, stiffness and damping, and the law that renders it.
 
     Attributes:
-        damping_ratio: ζ of B = 2·ζ·√(K·m) with the mass in force; 0: B as given. Default: 0.5, and
-            0 beside a damping that is given.
-        cap: c of the largest stiffness in force, c·m/T² with the mass in force, and on an elastic
-            shaft no more than what leaves its resonance stable; 0: as asked.
+        damping_ratio: ζ of B = 2·ζ·√(K·m) with stiffness and mass in force; 0: B as given.
+            Default: 0.5, and 0 beside a damping that is given.
+        cap: c of the largest stiffness in force, c·m/T² with the mass in force, and no more than
+            delay and encoder bear, or an elastic shaft without its resonance; 0: as asked.
     """
 
     law: str = "mean_force"

@@ -6,7 +6,7 @@ be known:
 - **Ripple that does not decay.** The force within 20 to 500 Hz (docs/results.md) has swung by more
   than RIPPLE_NM: a dozen times within 100 ms of which no 20 ms were much quieter than the others,
   or eight times, as the slowest of the band does, within 200 ms without falling to half. A bounce
-  dies away. While the force is lowered, half of either is enough.
+  dies away. While the force is lowered, half as often is enough, within 40 or 100 ms.
 - **A contact that gives off more than it took.** The wall has put out more energy than the operator
   put in, and the handle leaves faster than it came. Either alone is no sign: a hand that withdraws
   leaves faster, and on a soft wall friction takes what sampling adds. While the force is lowered,

@@ -1,6 +1,7 @@
 """One cycle from TPDO to RPDO, as one compiled function on one record.
 
-Counts → y → estimator → state at the instant of actuation → law → tension → limits → per mille.
+Counts → y → latch → estimator and bank → state at the instant of actuation → law → tension →
+passivity → guard → probe → limits → per mille.
 
 It is the largest compiled function. Compiled code calls it by its address: as a part of each of its
 callers it would take a fifth more of a first start.

@@ -157,7 +157,7 @@ BANK = np.dtype(
         ("transition", "f8", (MAX_FILTERS, 3, 3)),
         ("scale", "f8", (MAX_FILTERS, 3)),
         ("force_noise", "f8", (MAX_FILTERS,)),
-        # The stiffest wall that shaft, delay and encoder bear.
+        # The stiffest wall that an elastic shaft bears, or delay and encoder on a rigid one.
         ("stiffest", "f8", (MAX_FILTERS,)),
         ("delay_counts", "f8", (MAX_FILTERS,)),  # share of the doubt about the delay that counts
         ("regression", REGRESSION, (1,)),

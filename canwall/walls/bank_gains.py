@@ -5,8 +5,8 @@ that of the delay. Those of light hands have one more for the way to the wall. A
 slow for wall and hand makes them bounce, and one that is too quick for friction swings.
 
 What the steps of the encoder make felt grows with the bandwidth, and with the force at the handle
-that moves the mass by a count in a period, m·Δ/(T²·r): the count force of a hand. It decides which
-filter may be as quick as the delay allows, whatever encoder, period and rotor are.
+that accelerates the mass by a count per period², m·Δ/(T²·r): the count force of a hand. It decides
+which filter may be as quick as the delay allows, whatever encoder, period and rotor are.
 """
 
 import math
@@ -66,7 +66,7 @@ _UNTIMELY, _UNTIMELY_FROM = 0.04, (1.4, 2.2)
 #: them. (Bounded by anything but the covariance that belongs to its gain, a filter of a handle at
 #: rest diverges.)
 _EQUAL = 8.0
-#: Time constant at which a light hand's damping equals its inertia [s].
+#: Inertia over damping of the lightest hands [s].
 _HAND_S = 1.5e-3
 #: K·T²/m of the stiffest wall, the delay from which on it falls [periods], and the power of the
 #: delay with which it does: beyond, light hands bounce, and hunt in friction.

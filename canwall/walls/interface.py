@@ -66,8 +66,8 @@ WALL = np.dtype(
         # By how much larger ζ is in force, relatively, as long as mass or delay are in doubt.
         ("doubt", "f8"),
         ("cap", "f8"),
-        # Where there is a cap: the largest stiffness that shaft, delay and encoder bear with the
-        # mass in force.
+        # Where there is a cap: the largest stiffness with the mass in force that an elastic shaft
+        # bears, or delay and encoder on a rigid one.
         ("stiffest", "f8"),
         # Viscous damping of the device alone: no hand that is identified changes it.
         ("device_viscous", "f8"),

@@ -55,8 +55,8 @@ _LOST, _LOST_AT_REST = 0.005, 0.001
 #: Samples of a second difference.
 _SAMPLES = 3
 #: What phases differ by in a second difference for the sample to tell of them [counts], beyond a
-#: multiple of what torques do in it that are later by T_c: at rest they answer the steps of the
-#: encoder, which would look like an age.
+#: multiple of T_c/T of what torques make of it, and of what torques a period later would change in
+#: it: at rest they answer the steps of the encoder, which would look like an age.
 _TELLING, _OF_TORQUES = 1.0, 0.75
 #: Share of what is left of a second difference that counts as left all the time: d̂ is behind of the
 #: operator's push.

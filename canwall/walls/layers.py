@@ -49,7 +49,7 @@ def _observe_energy(wall: Record) -> None:
 
 @compiled
 def _tension(wall: Record, force: float) -> float:
-    """Return the pull that the policy allows: all, none, or what the absorbed energy covers."""
+    """Return the pull that the policy allows: all or none; with a budget all that E covers."""
     if wall.tension == _CLAMP:
         return 0.0
     if wall.tension == _BUDGET:

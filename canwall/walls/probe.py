@@ -34,7 +34,7 @@ _BEFORE_S, _HALF_S, _SAMPLES = 0.06, 0.004, 2
 #: for any but the lightest one [N·m].
 _COUNTS, _STRONGEST = 4.0, 0.04
 #: Way of a sample [counts] from which on the probe of a hand that is not known grows with it: the
-#: lightest handle moves by a third of its way.
+#: lightest handle moves by 4/3 of it.
 _WAY = 3.0
 
 

@@ -418,8 +418,8 @@ def _follow_growth(regression: Record, mass: float, alone: bool, quiet: bool) ->
 
     A push that grows under the first torques of the wall would look like mass.
 
-    mass: the one in force. alone: True if no torque but a probe's is in flight. quiet: True if it
-    says nothing.
+    mass: the one in force. alone: True while it is probed, or if no torque is in flight. quiet:
+    True if the torque says nothing.
     """
     if not alone:
         regression.growth *= regression.growth_left

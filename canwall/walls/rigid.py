@@ -2,7 +2,7 @@
 
 Its referent reverses the velocity at the surface instantly, scaled by the restitution. Where a
 finite torque lets the handle through, it is brought back to the surface by a share of its depth
-per period. Stiffness and damping have no effect.
+per period. Stiffness and damping have no effect on its force.
 """
 
 from canwall.compiled import Record, compiled

@@ -85,9 +85,9 @@ class WallLoop(NamedTuple):
 def stiffest_wall(shaft: ElasticShaft, loop: WallLoop, identified: bool = False) -> float:
     """Return the stiffness up to which a wall leaves the resonance of its shaft alone [N·m/rad].
 
-    It is an eighth of that up to which the loop is stable with a resonance 5 % off and a hand
-    lighter or heavier than the model's, 0 where there is none, and at most a quarter of the
-    shaft's; half of either for a hand that is identified.
+    It is an eighth of that up to which the loop is stable, 1.25·m/T² at the most, with a resonance
+    5 % off and a hand lighter or heavier than the model's, 0 where there is none, and at most a
+    quarter of the shaft's; half of either for a hand that is identified.
     """
     walls: Array = _LOOKED_AT * loop.mass / loop.period**2
     stable = len(walls)

@@ -4,8 +4,7 @@ With a finger's mass in its model the wall of an arm swings at 12 to 40 Hz, from
 and more. Until the swing is large, its torque changes no faster than that of a hand that pushes,
 and a light hand that pushes just so would make the wall answer with the same motion. But no hand
 pushes to and fro as fast: its own frequencies end below those of tremor (8 to 12 Hz). So a torque
-that has twice in a row gone to and fro faster than that is the wall's alone, and what it moves
-tells the mass.
+that has gone to and fro faster than that is the wall's alone, and what it moves tells the mass.
 """
 
 import math
@@ -79,7 +78,7 @@ def end_swing(swing: Record) -> None:
 
 @compiled
 def follow_swing(swing: Record, y: float, position: float, torque: float, turns_at: float) -> bool:
-    """Add a sample; return True at the end of a half before which no hand has pushed.
+    """Add a sample; return True at the end of the second half in a row that no hand makes.
 
     Args:
         swing: The swing.
