@@ -275,6 +275,7 @@ def load() -> None:
     from canwall.record.pictures import warm_up
     from canwall.run import assembly, run
     from canwall.simdrive.communication import dictionary
+    from canwall.sweep.plan import compute_piece, make_plan
 
     warm_up()
     assembly.load_eds = dictionary.load_eds = eds_read_once()  # type: ignore[attr-defined]
@@ -285,6 +286,8 @@ def load() -> None:
         settings = config.load(config.shipped("config/sim.toml"), given)
         with tempfile.TemporaryDirectory() as folder:
             run(settings, Path(folder) / "run")
+    one_strike = make_plan(settings, {"stiffness": 10.0, "speed": 1.0, "phase": 0.0})
+    compute_piece(one_strike, 0)
 
 
 def serve(requests: socket.socket) -> None:
