@@ -77,6 +77,9 @@ _LAG_NOISE_SHARE = 0.15
 #: the delay.
 _WELL_KNOWN_SPREAD = 0.05
 
+#: Addresses of cycle and row, data, and `received`, as `_step` takes them.
+_STEP_ARGUMENTS = types.uint64, types.uint64, types.int64, types.boolean
+
 
 @compiled
 def _signed(data: int, field: Record) -> int:
@@ -454,32 +457,31 @@ def step(cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: 
     """Return RPDO data for TPDO data (little-endian numbers), and fill the row of this cycle.
 
     cycles has dtype CYCLE and shape (1,), rows ROW and (1,). Without a TPDO (`received` False),
-    data is ignored. Compiled code has `step_at` for this.
+    data is ignored. Compiled code calls `step_at`.
     """
-    return int(_step_function().ctypes(cycles.ctypes.data, rows.ctypes.data, data, received))
+    return step_at(step_address(), cycles, rows, data, received)
 
 
+@functools.cache
 def step_address() -> int:
-    """Return the address of the compiled step in this process, for `step_at`."""
+    """Return the address of the compiled step in this process; compiled or loaded at first use."""
     return int(_step_function().address)
 
 
 @functools.cache
 def _step_function() -> Any:
-    """Return `_step` as a C function, compiled or loaded at its first use."""
-    number = types.int64
-    return compiled_for_c(_step, number(types.uint64, types.uint64, number, number))
+    """Return `_step` as a C function, which lives as long as this process."""
+    return compiled_for_c(_step, types.int64(*_STEP_ARGUMENTS))
 
 
 @intrinsic  # type: ignore[untyped-decorator]
 def _call_step(typingctx: Any, address: Any, cycle: Any, row: Any, data: Any, received: Any) -> Any:
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        number = ir.IntType(64)
-        function = ir.FunctionType(number, [number] * 4).as_pointer()
-        return builder.call(builder.inttoptr(arguments[0], function), arguments[1:])
+        taken = [context.get_value_type(argument) for argument in _STEP_ARGUMENTS]
+        function = ir.FunctionType(context.get_value_type(types.int64), taken)
+        return builder.call(builder.inttoptr(arguments[0], function.as_pointer()), arguments[1:])
 
-    number = types.int64
-    return number(types.uint64, types.uint64, types.uint64, number, number), codegen
+    return types.int64(types.uint64, *_STEP_ARGUMENTS), codegen
 
 
 @compiled
@@ -487,12 +489,11 @@ def step_at(
     address: int, cycles: NDArray[np.void], rows: NDArray[np.void], data: int, received: bool
 ) -> int:
     """Call `step`, which is at `step_address()`, from compiled code."""
-    return _call_step(address, cycles.ctypes.data, rows.ctypes.data, data, int(received))
+    return _call_step(address, cycles.ctypes.data, rows.ctypes.data, data, received)
 
 
-def _step(cycle_address: int, row_address: int, data: int, was_received: int) -> int:
+def _step(cycle_address: int, row_address: int, data: int, received: bool) -> int:
     """Do what `step` says, for the records at these addresses."""
-    received = was_received != 0
     cycles, rows = elements(cycle_address, 1, CYCLE), elements(row_address, 1, ROW)
     cycle: Record = cycles[0]
     rendered = cycle.rendered[0]

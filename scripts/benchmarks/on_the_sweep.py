@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 
 from canwall import config
-from canwall.cycle import Loop, run_laws, run_loop, step
+from canwall.cycle import Loop, run_laws, run_loop, step_address, step_at
 from canwall.record import ROW, Phase, Ring
 from canwall.run import drive_dictionary, make_axis, make_exchange, on_the_bus
 from canwall.run.closed_loop import SIGNALS, ClosedLoop, Disturbances, simulate, simulate_wall
@@ -76,6 +76,7 @@ def unknown_hand() -> dict[str, Any]:
     latching = _loop("mean_force", **all_of_it, **servo | {"servo": "800Hz"})
     settings = _settings("mean_force", **all_of_it, **servo)
     counts = simulate(settings, _STRIKE).rows["counts"]
+    address = step_address()
     cycles = [
         ClosedLoop(one, _STRIKE).records().cycle
         for one in (_settings("midpoint", **servo), settings)
@@ -83,7 +84,7 @@ def unknown_hand() -> dict[str, Any]:
     works = [
         full,
         latching,
-        *(partial(_replay, cycle, np.zeros(1, ROW), counts) for cycle in cycles),
+        *(partial(_replay, address, cycle, np.zeros(1, ROW), counts) for cycle in cycles),
     ]
     for work in works:
         work()
@@ -100,14 +101,15 @@ def unknown_hand() -> dict[str, Any]:
 
 
 @njit(nogil=True)
-def _replay(cycles: Any, rows: Any, counts: Any) -> None:
+def _replay(step: int, cycles: Any, rows: Any, counts: Any) -> None:
     cycle = cycles[0]
     for _ in range(_TURNS):
         for j in range(len(counts)):
             cycle.phase = _RENDERING
             cycle.trip = 0
             shown = cycle.torque_per_mille & 0xFFFF
-            step(cycles, rows, (counts[j] & 0xFFFFFFFF) | (0x27 << 32) | (shown << 48), True)
+            data = (counts[j] & 0xFFFFFFFF) | (0x27 << 32) | (shown << 48)
+            step_at(step, cycles, rows, data, True)
 
 
 def safeguards() -> dict[str, Any]:
