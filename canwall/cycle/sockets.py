@@ -26,6 +26,7 @@ from canwall.bus.raw_socket import (
 )
 from canwall.compiled import Record, compiled
 from canwall.cycle.core import CORE, Want, proceed, proceed_without, take
+from canwall.cycle.step import step_address
 from canwall.cycle.transport import CycleFrames
 from canwall.drive import Link
 
@@ -62,7 +63,8 @@ SOCKET = np.dtype(
 
 
 def compile_run() -> None:
-    """Compile what `SocketTransport.run` calls."""
+    """Compile what `SocketTransport.run` calls, the step first: it takes longest."""
+    step_address()
     _run.compile(np.zeros(1, CORE), np.zeros(1, SOCKET))  # type: ignore[attr-defined]
 
 
