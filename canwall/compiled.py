@@ -1,6 +1,7 @@
 """Compilation with numba: one decorator, and one type for records in compiled code."""
 
 import functools
+import inspect
 import math
 import os
 import subprocess
@@ -137,7 +138,7 @@ def compiled_for_c(function: Callable[..., Any], signature: Any, kept: bool = Tr
     """Compile a function to be called by its address, e.g. from a record by compiled code.
 
     Args:
-        function: The function.
+        function: The function; it may be one that is `compiled` for other callers as well.
         signature: Its signature, as numba's.
         kept: Cache the code on disk, for functions that call nothing but this package.
 
@@ -150,6 +151,7 @@ def compiled_for_c(function: Callable[..., Any], signature: Any, kept: bool = Tr
     from numba.core.ccallback import CFunc
     from numba.core.sigutils import normalize_signature
 
+    function = inspect.unwrap(function)
     result: Any = CFunc(function, normalize_signature(signature), {}, {"error_model": "numpy"})
     if kept and is_ours(function):
         result._cache = cache_class()(function, "C", _compiling.note_miss)

@@ -492,6 +492,7 @@ def step_at(
     return _call_step(address, cycles.ctypes.data, rows.ctypes.data, data, received)
 
 
+@compiled
 def _step(cycle_address: int, row_address: int, data: int, received: bool) -> int:
     """Do what `step` says, for the records at these addresses."""
     cycles, rows = elements(cycle_address, 1, CYCLE), elements(row_address, 1, ROW)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from canwall import config
 from canwall.compiled import copied
 from canwall.config import Settings
-from canwall.cycle import make_cycle, run_laws, start_at, step
+from canwall.cycle import make_cycle, run_laws, start_at, step_address, step_at
 from canwall.cycle.state import set_wall
 from canwall.drive import DriveSetup, Field, PdoLayout
 from canwall.record import ROW, Phase
@@ -102,6 +102,7 @@ class Strike(NamedTuple):
 
 @njit(error_model="numpy")
 def _move(
+    step: int,
     cycle: Any,
     row: Any,
     period: float,
@@ -146,7 +147,7 @@ def _move(
             counts = math.floor(latched / RAD_PER_COUNT + 0.5)
             shown = cycle[0].torque_per_mille
             data = (counts & 0xFFFFFFFF) | (0x27 << 32) | ((shown & 0xFFFF) << 48)
-            step(cycle, row, data, True)
+            step_at(step, cycle, row, data, True)
             # The drive has what was sent after the last SYNC; this comes with the next one.
             following = cycle[0].torque_per_mille * NM_PER_MILLE * (1.0 + servo.torque_error)
             in_force[j, 0] = row[0].stiffness_in_force
@@ -280,13 +281,13 @@ class Bench:
             referent_damping = damping
         operators = operator, operator if later is None else later
         done = _move(
-            cycle, row, self.period, self.servo, *operators, strike, stiffness, damping, False,
-            y, hand, applied, in_force,
+            step_address(), cycle, row, self.period, self.servo, *operators, strike, stiffness,
+            damping, False, y, hand, applied, in_force,
         )  # fmt: skip
         referent_y, referent_hand = np.zeros(n), np.zeros(n * FORCES)
         _move(
-            cycle, row, self.period, self.servo, *operators, strike, stiffness, referent_damping,
-            True, referent_y, referent_hand, np.zeros(n), np.zeros((n, 2)),
+            step_address(), cycle, row, self.period, self.servo, *operators, strike, stiffness,
+            referent_damping, True, referent_y, referent_hand, np.zeros(n), np.zeros((n, 2)),
         )  # fmt: skip
         return Signals(
             self.period, stiffness, y, hand, applied, in_force[:, 0], in_force[:, 1],
