@@ -45,7 +45,7 @@ def response(
 
 
 @pytest.mark.slow
-@settings(deadline=None, max_examples=30)
+@settings(deadline=None, max_examples=60)
 @example(delay=0.8046875, mass=5e-5, viscous=0.0)  # a fit that stops where sticking begins
 @given(
     delay=st.floats(0.0, 3.0),

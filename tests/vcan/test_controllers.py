@@ -96,7 +96,7 @@ def test_transmit_queue_that_is_full_for_a_moment(
         )
     finally:
         tc("qdisc", "del", "dev", controllers[1], "root")
-    assert json.loads(queue.stdout)[0]["drops"] > 50, "the queue has been full"
+    assert json.loads(queue.stdout)[0]["drops"] > 100, "the queue has been full"
     assert record.column("torque_cmd_per_mille").any()
     assert record.summary["missed_tpdo"] == 0
     assert_same_run(record, embedded, cycles=290)
